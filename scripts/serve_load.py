@@ -16,6 +16,7 @@ another one's. docs/performance.md says what the rows mean.
 """
 
 import argparse
+import importlib.util
 import io
 import json
 import os
@@ -163,14 +164,9 @@ def lerobot_client(stack, address, scene, text):
     return act
 
 
-def has_lerobot(options):
-    """Whether the build has its protocol, and this Python gRPC."""
-    try:
-        import grpc  # noqa: F401
-    except ImportError:
-        return False
-    command = [options.vla, "serve", options.bundle, "--lerobot", "here"]
-    return "libgrpc++" not in subprocess.run(list(map(str, command)), capture_output=True, text=True).stderr
+def has_grpc():
+    """Whether this Python can be a client of LeRobot's protocol."""
+    return importlib.util.find_spec("grpc") is not None
 
 
 def protocols(options):
@@ -178,7 +174,7 @@ def protocols(options):
     from vla_cpp.observation import robot_of
 
     kinds = [("openpi", openpi_client, 0.5), ("gr00t", gr00t_client, 0.5)]
-    kinds += [("lerobot", lerobot_client, 1.0)] if has_lerobot(options) else []
+    kinds += [("lerobot", lerobot_client, 1.0)] if has_grpc() else []
     with vla_cpp.Policy(str(options.bundle), threads=1) as policy:
         spec = robot_of(policy.spec, None)
     names = {one.name.rpartition(".")[2]: one.name for one in (*spec.views, *spec.states)}
