@@ -11,6 +11,7 @@ from typing import Any, Dict, List, Mapping, Sequence, Tuple
 
 from vla_cpp.eval import lerobot_reference as reference  # noqa: F401  (before lerobot)
 import torch
+from vla_cpp.output import whole_file
 
 PATCH, SHUFFLE = 16, 2  # pixels of a patch; patches, both ways, that become one token
 FLOW_STEPS = 10  # Euler steps from noise to chunk
@@ -137,6 +138,5 @@ def light(frames: torch.Tensor, random: torch.Generator) -> torch.Tensor:
 
 def keep(state: Dict[str, Any], file: Path) -> None:
     """What a training goes on from; an interruption leaves the file before it."""
-    partial = file.with_suffix(".part")
-    torch.save(state, partial)
-    partial.replace(file)
+    with whole_file(file) as part:
+        torch.save(state, part)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import vla_cpp
+from vla_cpp.output import whole_file
 
 
 def arguments():
@@ -44,7 +45,8 @@ def main():
     print(np.array2string(np.asarray(chunk), precision=4, suppress_small=True))
     print(", ".join(f"{stage} {ms:.1f} ms" for stage, ms in chunk.timing.items()))
     if args.out:
-        np.save(args.out, np.asarray(chunk))
+        with whole_file(args.out) as file:
+            np.save(file, np.asarray(chunk))
 
 
 if __name__ == "__main__":

@@ -135,12 +135,12 @@ def test_an_output_folder_that_is_missing_is_an_io_error(converter, tiny, tmp_pa
 
 
 def test_a_full_disk_is_an_io_error_that_leaves_nothing(converter, tiny, monkeypatch, capsys):
-    import vla_cpp.convert.bundle as bundle
+    import vla_cpp.output as output
 
     def full(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(bundle.os, "fsync", full)
+    monkeypatch.setattr(output.os, "fsync", full)
     assert main([converter.save(tiny), "-o", converter.out]) == 9
     assert "found No space left on device" in capsys.readouterr().err
     assert os.listdir(os.path.dirname(converter.out)) == ["policy"]

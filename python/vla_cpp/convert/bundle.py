@@ -3,21 +3,19 @@
 """A streaming writer of bundles (docs/bundle.md) and a reader for tests and tools.
 
 The header states every tensor before the first byte of data is written, so the file grows in one pass and never lies in
-memory. It carries a temporary name until the checksum is in place: a bundle that exists is complete. That name is free and of its own, so
-that nobody's file or link is written through.
+memory. It gets its name when the checksum is in place: a bundle that exists is complete.
 """
 
 from __future__ import annotations
 
 import mmap
-import os
 import struct
-import tempfile
-from contextlib import suppress
+from contextlib import ExitStack
 from typing import BinaryIO, Callable, Dict, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
+from ..output import whole_file
 from .dtypes import BUNDLE_DTYPES, GGML_TYPES
 from .errors import Code, refuse
 from .files import missing_extra
@@ -91,12 +89,6 @@ def _header(keys: Sequence[Key], tensors: Sequence[TensorInfo]) -> bytes:
     return header + _padding(len(header))
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
 class BundleWriter:
     """`with BundleWriter(path, keys, tensors) as out:` and then `out.write(name, array)` in the order of `tensors`, in pieces
     if one likes. Leaving the block completes the file; an exception removes it. `check`: called with the complete file under its
@@ -110,27 +102,16 @@ class BundleWriter:
         checksum = Key(CHECKSUM_KEY, "string", CHECKSUM_ZERO)
         # The checksum stands first, so that the text of its key is found before any vocabulary could contain it.
         self.header = _header([checksum, *keys], tensors)
+        self.n_bytes = len(self.header) + sum(t.n_bytes + len(_padding(t.n_bytes)) for t in self.tensors)
         self.left = 0
         self.next = 0
 
     def __enter__(self) -> "BundleWriter":
-        folder, name = os.path.split(self.path)
-        descriptor, self.part = tempfile.mkstemp(".part", name + ".", folder or ".")
-        self.file: BinaryIO = os.fdopen(descriptor, "w+b")
-        try:
-            os.chmod(self.part, 0o666 & ~_umask())
+        with ExitStack() as stack:
+            self.file: BinaryIO = stack.enter_context(whole_file(self.path))
             self.file.write(self.header)
-        except BaseException:
-            self._drop()
-            raise
+            self.output = stack.pop_all()
         return self
-
-    def _drop(self) -> None:
-        """What a full disk did not take is lost with the file."""
-        with suppress(OSError):
-            self.file.close()
-        with suppress(FileNotFoundError):
-            os.remove(self.part)
 
     def write(self, name: str, data: np.ndarray) -> None:
         if self.left == 0:
@@ -145,14 +126,13 @@ class BundleWriter:
             self.file.write(_padding(tensor.n_bytes))
 
     def __exit__(self, kind, error, trace) -> None:
-        try:
-            if kind is None:
-                self._finish()
-                self.file.close()
-                self.check(self.part)
-                os.replace(self.part, self.path)
-        finally:
-            self._drop()
+        if error is not None:
+            self.output.__exit__(kind, error, trace)
+            return
+        with self.output:
+            self._finish()
+            self.file.flush()
+            self.check(self.file.name)
 
     def _finish(self) -> None:
         if self.left or self.next != len(self.tensors):
@@ -161,8 +141,6 @@ class BundleWriter:
         digest = file_digest(self.file)
         self.file.seek(digits)
         self.file.write(digest.encode())
-        self.file.flush()
-        os.fsync(self.file.fileno())
 
 
 def file_digest(file: BinaryIO, digits: int = -1) -> str:

@@ -13,6 +13,7 @@ from typing import Callable, Dict, Iterator, List, Tuple
 import numpy as np
 
 from .. import __version__
+from ..output import is_file, is_special
 from . import archs
 from .adapters import merge, stored_dtype
 from .archs import MATRIX, SCALE, TABLE, TERNARY, Options, Plan, Weight
@@ -74,19 +75,19 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
         plan.weights = [weight._replace(keep_f32=weight.keep_f32 or not weight.in_bf16) for weight in plan.weights]
     summary = Summary(out, arch, dtype, dropped=dropped, notes=checkpoint.notes)
     _write(checkpoint, plan, summary, problems, progress, _opener(vla, options.vla == NONE, out, plan, summary))
-    summary.n_bytes = os.path.getsize(out)
     return summary
 
 
 def _convert_to_codes(source: str, out: str, options: Options, force: bool, progress: Progress) -> Summary:
     """By way of a bundle of the stored floats, which lies beside `out` meanwhile."""
     vla = program(options.vla)
-    with tempfile.TemporaryDirectory(dir=os.path.dirname(os.path.abspath(out)), prefix=".vla-convert-") as folder:
+    beside = None if is_special(out) else os.path.dirname(os.path.realpath(out))
+    with tempfile.TemporaryDirectory(dir=beside, prefix=".vla-convert-") as folder:
         stored = os.path.join(folder, "stored.gguf")
         summary = convert_checkpoint(source, stored, options.replaced(dtype=""), progress=progress)
         progress("quantizing", 0, 1)
         quantize(vla, stored, out, options.dtype, force)
-    summary.path, summary.n_bytes = out, os.path.getsize(out)
+    summary.path, summary.n_bytes = out, os.path.getsize(out) if is_file(out) else 0
     summary.codes = options.dtype
     return summary
 
@@ -94,7 +95,7 @@ def _convert_to_codes(source: str, out: str, options: Options, force: bool, prog
 def _check_out(out: str, force: bool) -> None:
     if os.path.isdir(out):
         raise refuse("-o " + out, "a file name", "a folder", code=Code.USAGE)
-    if os.path.exists(out) and not force:
+    if is_file(out) and not force:
         raise refuse("-o " + out, "a name that is free", "an existing file", "--force overwrites it", Code.USAGE)
     if not os.path.isdir(os.path.dirname(os.path.abspath(out))):
         raise refuse("-o " + out, "an existing folder", "none", code=Code.IO)
@@ -208,7 +209,7 @@ def _write(
             problems.raise_any()
     except OSError as error:
         raise refuse(summary.path, "a file that can be written", error.strerror or str(error), code=Code.IO)
-    summary.n_tensor = len(tensors)
+    summary.n_tensor, summary.n_bytes = len(tensors), out.n_bytes
 
 
 def _pieces(entry: Entry, weight: Weight) -> Iterator[np.ndarray]:

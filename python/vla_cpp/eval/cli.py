@@ -12,6 +12,7 @@ from typing import Any, Dict, List, Optional
 
 from ..errors import BadObservation, UsageError, VlaError
 from ..installed import extra_hint
+from ..output import write_text
 from .environment import EnvironmentFault
 from .environments import NAMES, MissingSimulator, find, no_task
 from .episode import Job
@@ -63,7 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
         _common(command)
         if find(name).suites():
             _suites(command, find(name).suites())
-        command.add_argument("--replan-every", type=int, default=0, metavar="S", help="steps executed of a chunk (default: the environment's)")
+        command.add_argument("--replan-every", type=int, default=0, metavar="S", help="steps executed of a chunk (default: the checkpoint's n_action_steps, or else the environment's)")
         command.add_argument("--mode", choices=("sync", "async", "rtc"), default="sync", help="how chunks follow each other: the robot waits for each; it goes on with the one before meanwhile; the same, and the policy goes on from its rows (default sync)")
         command.add_argument("--latency-ms", type=float, default=0.0, metavar="MS", help="let this time of the simulator pass between an observation and its chunk (default 0)")
         command.add_argument("--against", metavar="POLICY", help="compare with torch:DIR, another bundle, a server's address, or random")
@@ -199,8 +200,8 @@ def replan(a: argparse.Namespace) -> Dict[str, Any]:
             rows.append({"replan_every": s, "success": data["success"]["all"], "latency": data["latency"]})
     summary = {"run": {**data["run"], "replan_every": intervals}, "intervals": rows}
     text = "\n".join(replan_table(rows))
-    (folder / "summary.md").write_text(text + "\n", encoding="utf-8")
-    (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    write_text(folder / "summary.md", text + "\n")
+    write_text(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
     try:
         from . import plots
     except ImportError:

@@ -7,10 +7,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import queue
-from pathlib import Path
 from typing import Any, Callable, Dict, Iterator, Sequence, Tuple
 
 import numpy as np
+
+from ..output import whole_file
 
 
 def chunks(actions: Sequence[np.ndarray], every: int, horizon: int) -> Tuple[np.ndarray, np.ndarray]:
@@ -24,10 +25,8 @@ def chunks(actions: Sequence[np.ndarray], every: int, horizon: int) -> Tuple[np.
 
 def write(path: str, arrays: Dict[str, Any]) -> None:
     """An .npz file that is there whole or not at all."""
-    partial = Path(path).with_suffix(".part")
-    with partial.open("wb") as file:
+    with whole_file(path) as file:
         np.savez(file, **arrays)
-    partial.replace(path)
 
 
 def reports(work: Callable, arguments: Sequence[Tuple], count: int) -> Iterator[Any]:

@@ -11,6 +11,7 @@ from typing import Any, Callable, List, Optional, Sequence, Tuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from ..output import whole_file
 from .episode import Look, Outcome, Watcher
 
 INK, FAINT, GRID, PAPER = (32, 36, 44), (122, 130, 142), (226, 229, 234), (255, 255, 255)
@@ -162,7 +163,8 @@ def _gif(pages: List[Image.Image], path: Path, fps: float) -> Path:
         sample.paste(colour, (40 * i, 5 * small[0].height, 40 * i + 40, sample.height))
     palette = sample.quantize(96)
     drawn = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in small]
-    drawn[0].save(str(path), save_all=True, append_images=drawn[1:], duration=int(1000 / fps), loop=0, optimize=True)
+    with whole_file(path) as file:
+        drawn[0].save(file, "GIF", save_all=True, append_images=drawn[1:], duration=int(1000 / fps), loop=0, optimize=True)
     return path
 
 
@@ -177,4 +179,5 @@ def contact_sheet(scene: Scene, path: Path, columns: int = 3) -> None:
     page = Image.new("RGB", (columns * wide, rows * high), PAPER)
     for i, shot in enumerate(shots):
         page.paste(scene.page(shot).resize((wide, high), Image.LANCZOS), ((i % columns) * wide, (i // columns) * high))
-    page.save(str(path), optimize=True)
+    with whole_file(path) as file:
+        page.save(file, "PNG", optimize=True)

@@ -14,6 +14,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator  # noqa: E402
 
+from ..output import whole_file  # noqa: E402
+
 BLUE, ORANGE, GREY, INK = "#1362c4", "#e07b1f", "#7a828e", "#20242c"
 
 
@@ -24,7 +26,8 @@ def _finish(figure: Any, title: str, path: Path) -> None:
         axes.grid(axis="y", color="#e2e5ea", linewidth=0.8)
         axes.set_axisbelow(True)
     figure.suptitle(title, fontsize=10.5, x=0.01, ha="left")
-    figure.savefig(str(path), dpi=150)
+    with whole_file(path) as file:
+        figure.savefig(file, format=path.suffix[1:], dpi=150)
     plt.close(figure)
 
 

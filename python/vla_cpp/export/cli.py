@@ -13,6 +13,7 @@ from typing import Any, Dict, Iterator, List, Optional
 
 from ..errors import IoError, UsageError, VlaError
 from ..installed import extra_hint
+from ..output import is_special, whole_file
 
 EPILOG = """examples:
   vla-export recording --mcap out.mcap
@@ -69,7 +70,7 @@ def export(a: argparse.Namespace) -> None:
     if (a.lerobot is None) != (a.fps is None) or (a.fps is not None and a.fps < 1) or not a.gap > 0:
         raise UsageError("--lerobot", "--fps above 0 with it, and only with it", "", "--gap is above 0 too")
     for path in filter(None, (a.mcap, a.rrd, a.lerobot)):
-        if path.exists():
+        if path.exists() and not is_special(path):
             raise IoError(str(path), "a name that is free", "a file or folder")
     acts = _Acts(a)
     if not acts.is_whole:
@@ -77,19 +78,27 @@ def export(a: argparse.Namespace) -> None:
     if a.mcap:
         from .mcap_file import write_mcap
 
-        _whole(a.mcap, lambda part: write_mcap(part, acts.spec, acts))
+        _file(a.mcap, lambda part: write_mcap(part, acts.spec, acts))
     if a.rrd:
         from .rerun_file import write_rrd
 
-        _whole(a.rrd, lambda part: write_rrd(part, acts.spec, acts))
+        _file(a.rrd, lambda part: write_rrd(part, a.rrd.name, acts.spec, acts))
     if a.lerobot:
         from .lerobot_dataset import write_lerobot
 
-        counts = _whole(a.lerobot, lambda part: write_lerobot(part, acts, a.fps, a.gap))
+        counts = _folder(a.lerobot, lambda part: write_lerobot(part, acts, a.fps, a.gap))
         print(f"{counts['frames']} frames in {counts['episodes']} episodes")
 
 
-def _whole(path: Path, write: Any) -> Any:
+def _file(path: Path, write: Any) -> None:
+    try:
+        with whole_file(path) as part:
+            write(Path(part.name))
+    except OSError as problem:
+        raise IoError(str(path), "a place to write", str(problem)) from None
+
+
+def _folder(path: Path, write: Any) -> Any:
     """Writes beside `path`, and gives it its name when it is whole."""
     part = path.with_name(path.name + ".part")
     try:
@@ -101,8 +110,6 @@ def _whole(path: Path, write: Any) -> Any:
     finally:
         if part.is_dir():
             shutil.rmtree(part)
-        elif part.exists():
-            part.unlink()
 
 
 def main(argv: Optional[List[str]] = None) -> int:

@@ -16,8 +16,9 @@ from ..spec import Spec
 from .common import column_names, picture_file
 
 
-def write_rrd(path: Path, spec: Spec, acts: Iterable[RecordedAct]) -> None:
-    stream = rerun.RecordingStream("vla_cpp", recording_id=spec.bundle.checksum + path.stem)
+def write_rrd(path: Path, name: str, spec: Spec, acts: Iterable[RecordedAct]) -> None:
+    """`name` tells recordings of a policy apart."""
+    stream = rerun.RecordingStream("vla_cpp", recording_id=spec.bundle.checksum + name)
     stream.save(str(path))
     named = False
     for act in acts:
