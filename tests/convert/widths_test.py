@@ -66,6 +66,12 @@ def test_statistics_of_two_widths_are_no_answer(converter, tiny):
     assert "statistics of observation.state: std: expected shape (3,), found (2,)" in converter.refusal(tiny).message()
 
 
+def test_a_single_number_for_all_is_no_width(converter, tiny):
+    for name in ("mean", "std"):
+        tiny.stats["observation.state." + name] = np.ones(1, np.float32)
+    assert "statistics of observation.state: mean: expected shape (3,), found (1,)" in converter.refusal(tiny).message()
+
+
 def test_what_the_mode_does_not_read_does_not_count(converter, tiny):
     tiny.stats["observation.state.min"] = np.ones(5, np.float32)
     assert converter.bundle(tiny).keys["observation.state_dims"] == [3]

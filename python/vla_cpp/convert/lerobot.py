@@ -121,6 +121,8 @@ def _width(policy: Section, checkpoint: Checkpoint, options: Options, key: str, 
     stated = vector_dim(policy, key, name, kind) if name in _features(policy, key) else "none"
     if stated == found:
         return found
+    if found == 1 and not options.widths:  # which the reference spreads over a state of any width
+        return vector_dim(policy, key, name, kind)
     text = "{} has {} numbers, as its statistics do, and not the {} of config.json: {}"
     checkpoint.notes.append(text.format(name, found, stated, "--widths config would follow that" if follows else "--widths statistics"))
     return found

@@ -106,7 +106,7 @@ def _others(known: Sequence[str]) -> str:
 def _check_statistic(where: str, name: str, value: np.ndarray, widths: Tuple[int, int], context: Context) -> None:
     if value.ndim != 1 or not widths[0] <= value.size <= widths[1]:
         wanted = "shape " + " to ".join("({},)".format(width) for width in sorted(set(widths)))
-        context.problems.add(where, wanted, str(value.shape), WIDTHS if value.ndim == 1 else "")
+        context.problems.add(where, wanted, str(value.shape), WIDTHS if value.ndim == 1 and widths[0] == widths[1] else "")
     elif not np.isfinite(value).all():
         context.problems.add(
             where, "finite numbers", str(value[~np.isfinite(value)][0]), "the statistics were never filled in: save the policy again"
