@@ -18,7 +18,7 @@ struct Answer {
   std::optional<Error> error;
   Clock::time_point started, finished;
   Timing stages;
-  bool is_beyond = false;          // the state is beyond the bundle's bound
+  bool out_of_range = false;       // the state is beyond the bundle's bound
   std::vector<std::string> notes;  // of the chunk
   Record record;                   // of an act of another protocol, where one is kept
 };

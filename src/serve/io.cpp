@@ -159,7 +159,7 @@ void Io::deliver(Answer& answer) {
                     answer.response.size(),
                     native != nullptr ? native->span() : std::as_bytes(std::span(answer.record.request)),
                     std::as_bytes(std::span(native != nullptr ? answer.response : answer.record.response)),
-                    answer.is_beyond,
+                    answer.out_of_range,
                     answer.notes};
   job.call->send(answer.response);
   if (answer.error) {

@@ -338,7 +338,7 @@ Status Server::respond(Act& act) const {
   VLA_TRY(ActionChunk chunk, policy.engine->act(act.encoded()));
   answer.stages.insert(answer.stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = answer.stages;
-  answer.is_beyond = chunk.out_of_range, answer.notes = chunk.notes;
+  answer.out_of_range = chunk.out_of_range, answer.notes = chunk.notes;
   act.request.observation.embodiment = act.encoded().robot->bundle().embodiment();
   const double queue_ms = std::chrono::duration<double, std::milli>(answer.started - answer.job.at).count();
   Reply reply{act.request, std::move(chunk), queue_ms};
