@@ -201,8 +201,8 @@ Status Bundle::choose(const std::string& tag) {
   return {};
 }
 
-Result<std::span<const std::byte>> Bundle::read(std::span<const std::byte> part, Room& room) const {
-  if (const std::byte* bytes = content_->read(part, room)) return std::span(bytes, part.size());
+Result<std::span<const std::byte>> Bundle::read(std::span<const std::byte> part, ReadBuffer& buffer) const {
+  if (const std::byte* bytes = content_->read(part, buffer)) return std::span(bytes, part.size());
   return content_->changed();
 }
 
@@ -222,8 +222,8 @@ Result<std::vector<double>> Bundle::stats(std::string_view name) const {
                  fmt::format("{} dimensions of {}", tensor->shape.size(), dtype_name(tensor->type))};
   std::vector<double> values(static_cast<std::size_t>(tensor->count()));
   std::vector<float> narrow(is_wide ? 0 : values.size());
-  Room room;
-  VLA_TRY(const std::span<const std::byte> data, read(tensor->data, room));
+  ReadBuffer buffer;
+  VLA_TRY(const std::span<const std::byte> data, read(tensor->data, buffer));
   std::memcpy(is_wide ? static_cast<void*>(values.data()) : narrow.data(), data.data(), data.size());
   std::copy(narrow.begin(), narrow.end(), values.begin());
   for (const double value : values)

@@ -58,9 +58,9 @@ class Bundle {
   std::size_t file_size() const { return content_->bytes().size(); }
   /// Where bytes of a tensor are in the file.
   std::ptrdiff_t offset(const std::byte* data) const { return data - content_->bytes().data(); }
-  /// The bytes of a tensor or of a part of it, in `room` where they come from a file. Errors: bad_bundle, where the
+  /// The bytes of a tensor or of a part of it, in `buffer` where they come from a file. Errors: bad_bundle, where the
   /// file has been changed since it was opened.
-  Result<std::span<const std::byte>> read(std::span<const std::byte> part, Room& room) const;
+  Result<std::span<const std::byte>> read(std::span<const std::byte> part, ReadBuffer& buffer) const;
   /// The file or memory that tensors are read from; it may outlive the bundle.
   const std::shared_ptr<const Content>& content() const { return content_; }
 

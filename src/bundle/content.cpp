@@ -89,12 +89,12 @@ Status Content::seal(const std::function<void(std::span<const std::byte>)>& see)
     return {};
   }
   const auto start = std::chrono::steady_clock::now();
-  Room room;
+  ReadBuffer buffer;
   sums_.reserve(bytes_.size() / kBlock + 1);
   for (std::size_t offset = 0; offset < bytes_.size(); offset += kPiece) {
     std::span<const std::byte> piece = bytes_.subspan(offset, std::min(kPiece, bytes_.size() - offset));
     if (offset >= shown_) {  // what was shown has been parsed as it is
-      const std::span<std::byte> to(room.take(kPiece), piece.size());
+      const std::span<std::byte> to(buffer.take(kPiece), piece.size());
       VLA_CHECK(fill(offset, to));
       piece = to;
     }
@@ -111,12 +111,12 @@ Status Content::seal(const std::function<void(std::span<const std::byte>)>& see)
   return {};
 }
 
-const std::byte* Content::read(std::span<const std::byte> part, Room& room) const {
+const std::byte* Content::read(std::span<const std::byte> part, ReadBuffer& buffer) const {
   if (file_ < 0 || part.empty()) return part.data();
   const auto offset = static_cast<std::size_t>(part.data() - bytes_.data());
   const std::size_t first = offset / kBlock * kBlock;
   const std::size_t end = std::min(bytes_.size(), (offset + part.size() + kBlock - 1) / kBlock * kBlock);
-  const std::span<std::byte> blocks(room.take(end - first), end - first);
+  const std::span<std::byte> blocks(buffer.take(end - first), end - first);
   if (read_at(file_, first, blocks) != static_cast<ssize_t>(blocks.size())) return nullptr;
   for (std::size_t i = 0; i < blocks.size(); i += kBlock)
     if (XXH3_64bits(&blocks[i], std::min(kBlock, blocks.size() - i)) != sums_[(first + i) / kBlock]) return nullptr;

@@ -15,7 +15,7 @@
 namespace vla {
 
 /// Memory that parts of a file are read into, again and again.
-class Room {
+class ReadBuffer {
  public:
   /// At least `size` bytes, at a multiple of 64. Throws std::bad_alloc.
   std::byte* take(std::size_t size) {
@@ -56,10 +56,10 @@ class Content {
 
   /// Bytes a second that `seal` read and compared; 0 of memory.
   double read_rate() const { return read_rate_; }
-  /// A part of `bytes()`, in `room` where there is a file; null where the file has not these bytes any more. Once
-  /// `room` is as large as `room_for` the part, this takes no memory. Threads may read at a time.
-  const std::byte* read(std::span<const std::byte> part, Room& room) const;
-  static constexpr std::size_t room_for(std::size_t size) { return (size / kBlock + 2) * kBlock; }
+  /// A part of `bytes()`, in `buffer` where there is a file; null where the file has not these bytes any more. Takes no
+  /// memory once `buffer` has `buffer_size` of the part. Threads may read at a time.
+  const std::byte* read(std::span<const std::byte> part, ReadBuffer& buffer) const;
+  static constexpr std::size_t buffer_size(std::size_t size) { return (size / kBlock + 2) * kBlock; }
   /// Has the system read a part of the file ahead, without waiting for it.
   void expect(std::span<const std::byte> part) const;
   /// Lets the system give up what it keeps of a part of the file: nobody is about to read it again.

@@ -103,7 +103,7 @@ void BundleFile::put(std::span<const std::byte> bytes) {
 Status BundleFile::copy(const Bundle& bundle, const TensorInfo& tensor, const std::function<void(std::size_t)>& see) {
   constexpr std::size_t kPart = std::size_t{1} << 22;
   for (std::size_t at = 0; at < tensor.data.size(); at += kPart) {
-    VLA_TRY(const auto part, bundle.read(tensor.data.subspan(at, std::min(kPart, tensor.data.size() - at)), room_));
+    VLA_TRY(const auto part, bundle.read(tensor.data.subspan(at, std::min(kPart, tensor.data.size() - at)), buffer_));
     put(part);
     see(part.size());
   }

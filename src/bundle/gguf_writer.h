@@ -51,7 +51,7 @@ class BundleFile {
   int errno_ = 0;
   std::size_t size_ = 0, digits_ = 0;  // bytes written, and where the checksum's digits are
   std::unique_ptr<XXH3_state_s, int (*)(XXH3_state_s*)> state_;
-  Room room_;
+  ReadBuffer buffer_;
 };
 
 }  // namespace vla

@@ -48,9 +48,9 @@ bool has_wrong_code(DType type, std::span<const std::byte> codes) {
 /// The same of a tensor, read part by part.
 Result<bool> has_wrong_code(const Bundle& bundle, DType type, std::span<const std::byte> codes) {
   constexpr std::size_t kPart = sizeof(Int4Block) << 15;
-  Room room;
+  ReadBuffer buffer;
   for (std::size_t i = 0; i < codes.size(); i += kPart) {
-    VLA_TRY(const auto part, bundle.read(codes.subspan(i, std::min(kPart, codes.size() - i)), room));
+    VLA_TRY(const auto part, bundle.read(codes.subspan(i, std::min(kPart, codes.size() - i)), buffer));
     if (has_wrong_code(type, part)) return true;
   }
   return false;

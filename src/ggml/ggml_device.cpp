@@ -126,21 +126,21 @@ std::size_t GgmlDevice::size_of(const Param& matrix) const { return memory().siz
 Status GgmlDevice::upload(const ParamList& params) {
   const Content& content = *params.bundle()->content();
   lower::Packer packer;
-  Room room;
+  ReadBuffer buffer;
   for (const Param& param : params.params()) {
     if (is_streamed(param)) continue;
     ggml_tensor* tensor = weight(&param);
     std::span<const std::byte> data;
     if (param.storage == Storage::matrix) {
       lower::MatrixPlace place = place_of(param, tensor->type);
-      place.put(param, room.take(ggml_nbytes(tensor)));
+      place.put(param, buffer.take(ggml_nbytes(tensor)));
       std::vector<lower::PackPart> parts;
       lower::add_parts(param, place, parts);
       for (const lower::PackPart& part : parts)
         if (!packer.run(content, part)) return content.changed();
       data = {place.data, ggml_nbytes(tensor)};
     } else {
-      VLA_TRY(data, params.bundle()->read(param.source->data, room));
+      VLA_TRY(data, params.bundle()->read(param.source->data, buffer));
     }
     VLA_CHECK(guarded([&] { ggml_backend_tensor_set(tensor, data.data(), 0, data.size()); }));
   }

@@ -27,7 +27,7 @@ class CodeMaker {
   Encoding wanted_;
   const Bundle* made_ = nullptr;
   std::span<const float> feedback_;
-  Room codes_, scales_;
+  ReadBuffer codes_, scales_;
   std::vector<float> rows_;
 };
 

@@ -110,7 +110,7 @@ class Writer {
 
  private:
   Result<std::span<const std::byte>> read(std::span<const std::byte> part) {
-    VLA_TRY(const auto bytes, bundle_.read(part, room_));
+    VLA_TRY(const auto bytes, bundle_.read(part, buffer_));
     tell(part.size());
     return bytes;
   }
@@ -122,7 +122,7 @@ class Writer {
   const Int4Codes& int4_;
   BundleFile& out_;
   const std::function<void(QuantizeProgress)>& report_;
-  Room room_;
+  ReadBuffer buffer_;
   std::int64_t done_ = 0;
 };
 

@@ -62,7 +62,7 @@ class Scaler {
       const std::int64_t n = std::min(kPartRows, n_row - first);
       VLA_TRY(const auto part, bundle_.read(tensor.data.subspan(static_cast<std::size_t>(first) * row_size,
                                                                 static_cast<std::size_t>(n) * row_size),
-                                            room_));
+                                            buffer_));
       row_.resize(static_cast<std::size_t>(d));
       for (std::int64_t i = 0; i < n; ++i) {
         for (std::int64_t k = 0; k < d; ++k)
@@ -90,7 +90,7 @@ class Scaler {
 
  private:
   const Bundle& bundle_;
-  Room room_;
+  ReadBuffer buffer_;
   std::vector<float> row_;
 };
 

@@ -255,8 +255,8 @@ TEST_CASE("a report of very many problems names the first fifty and counts the o
 
 /// A tensor's bytes, or the refusal.
 std::string read_text(const Bundle& bundle, const char* name) {
-  Room room;
-  const auto data = bundle.read(bundle.find(name)->data, room);
+  ReadBuffer buffer;
+  const auto data = bundle.read(bundle.find(name)->data, buffer);
   return data ? std::string(reinterpret_cast<const char*>(data->data()), data->size()) : data.error().message();
 }
 
@@ -277,9 +277,9 @@ TEST_CASE("a file that is written over or cut after it was opened is refused whe
     CHECK(read_text(*bundle, "lm.weight") == std::string(32, '\1'));
     CHECK(bundle->stats("stats.x")->size() == 3);
     CHECK(contains(read_text(*bundle, "lm.large"), "renaming a new file over it"));
-    Room room;
+    ReadBuffer buffer;
     const auto beginning = bundle->find("lm.large")->data.first(1 << 20);
-    CHECK(bundle->read(beginning, room).ok());
+    CHECK(bundle->read(beginning, buffer).ok());
     std::remove(path.c_str());
     CHECK(bundle->stats("stats.x")->size() == 3);
   }

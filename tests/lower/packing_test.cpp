@@ -37,8 +37,8 @@ struct Codes {
   /// The scales that lie behind the packed matrix.
   std::vector<float> packed_scales() const {
     MatrixPlace place = {.encoding = matrix.encoding, .packing = {size, copy}, .n_scale = kRows};
-    Room room;
-    place.put(matrix, room.take(place.size_of(matrix)));
+    ReadBuffer buffer;
+    place.put(matrix, buffer.take(place.size_of(matrix)));
     std::vector<PackPart> parts;
     add_parts(matrix, place, parts);
     CHECK(parts.size() > 1);

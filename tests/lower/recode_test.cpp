@@ -20,8 +20,8 @@ Recoded recoded(std::vector<float> values, DType stored, Encoding wanted) {
   const std::vector<std::byte> from = test::store_as(stored, values);
   const auto count = static_cast<std::int64_t>(values.size());
   Recoded result = {{}, std::vector<float>(static_cast<std::size_t>(wanted.n_scale(count)))};
-  Room room;
-  const std::byte* to = Recode{{stored}, wanted}(from.data(), nullptr, count, room, result.scales.data());
+  ReadBuffer buffer;
+  const std::byte* to = Recode{{stored}, wanted}(from.data(), nullptr, count, buffer, result.scales.data());
   result.bytes.assign(to, to + dtype_size(wanted.type, count));
   return result;
 }
@@ -47,11 +47,11 @@ TEST_CASE("int8 codes have a scale for every group: for each row, or several in 
 
 TEST_CASE("what is stored as it is wanted stays where it is, codes too") {
   const std::vector<std::byte> stored(8, std::byte{0x15});
-  Room room;
+  ReadBuffer buffer;
   for (const Encoding same : {Encoding{DType::f32}, Encoding{DType::bf16}, Encoding{DType::ternary, 8}}) {
     const Recode recode = {same, same};
     CHECK_FALSE(recode.changes());
-    CHECK(recode(stored.data(), nullptr, 2, room, nullptr) == stored.data());
+    CHECK(recode(stored.data(), nullptr, 2, buffer, nullptr) == stored.data());
   }
 }
 
@@ -74,8 +74,8 @@ TEST_CASE("floats become float32 without a change") {
 TEST_CASE("codes become float32 by the scale of their group") {
   const std::vector<std::byte> codes = {std::byte{127}, std::byte{0x81}, std::byte{3}, std::byte{0}};
   const std::vector<float> scales = {0.1f, 2};
-  Room room;
-  const std::byte* to = Recode{{DType::i8, 2}, {DType::f32}}(codes.data(), scales.data(), 4, room, nullptr);
+  ReadBuffer buffer;
+  const std::byte* to = Recode{{DType::i8, 2}, {DType::f32}}(codes.data(), scales.data(), 4, buffer, nullptr);
   const auto* values = reinterpret_cast<const float*>(to);
   CHECK(std::vector<float>(values, values + 4) == std::vector<float>{127 * 0.1f, -127 * 0.1f, 6, 0});
 }
@@ -86,8 +86,8 @@ TEST_CASE("int4 codes become float32 by their step and the scale of their row") 
   codes[0] = -7, codes[1] = 5, codes[64] = 2, codes[kWidth + 69] = 3;
   const std::vector<std::byte> stored = test::store_int4(codes, kWidth, {17, 3, 1, 2});
   const std::vector<float> scales = {0.1f, 0.5f};
-  Room room;
-  const std::byte* to = Recode{{DType::int4, kWidth}, {DType::f32}}(stored.data(), scales.data(), 140, room, nullptr);
+  ReadBuffer buffer;
+  const std::byte* to = Recode{{DType::int4, kWidth}, {DType::f32}}(stored.data(), scales.data(), 140, buffer, nullptr);
   const auto* values = reinterpret_cast<const float*>(to);
   CHECK(values[0] == -119 * 0.1f);
   CHECK(values[1] == 85 * 0.1f);

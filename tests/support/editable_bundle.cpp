@@ -20,9 +20,9 @@ EditableBundle EditableBundle::read(const std::string& path) {
   REQUIRE_MESSAGE(bundle.ok(), (bundle ? "" : bundle.error().message()));
   EditableBundle copy;
   copy.keys = bundle->keys();
-  Room room;
+  ReadBuffer buffer;
   for (const TensorInfo& tensor : bundle->tensors()) {
-    const auto data = bundle->read(tensor.data, room);
+    const auto data = bundle->read(tensor.data, buffer);
     REQUIRE(data.ok());
     copy.tensors.push_back(
         {tensor.name, tensor.type, tensor.shape, {reinterpret_cast<const char*>(data->data()), data->size()}});

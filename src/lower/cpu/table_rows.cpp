@@ -21,7 +21,7 @@ Result<std::unique_ptr<TableRows>> TableRows::make(const Bundle& bundle, const P
   rows->content_ = bundle.content(), rows->table_ = table.source->data;
   rows->row_size_ = rows->table_.size() / n_row;
   rows->index_.assign(n_kept, kNoRow);
-  rows->room_.take(Content::room_for(rows->row_size_));  // so that a look-up takes no memory
+  rows->buffer_.take(Content::buffer_size(rows->row_size_));  // so that a look-up takes no memory
   VLA_TRY(rows->kept_, Memory::allocate(n_kept * rows->row_size_, "rows of " + table.name));
   return rows;
 }
@@ -41,7 +41,7 @@ std::byte* TableRows::place(std::int64_t i) {
   std::int64_t& index = index_[static_cast<std::size_t>(at)];
   if (index == i) return kept;
   index = kNoRow;
-  const std::byte* row = content_->read(table_.subspan(static_cast<std::size_t>(i) * row_size_, row_size_), room_);
+  const std::byte* row = content_->read(table_.subspan(static_cast<std::size_t>(i) * row_size_, row_size_), buffer_);
   if (row == nullptr) return nullptr;
   std::memcpy(kept, row, row_size_);
   index = i;

@@ -34,7 +34,7 @@ class TableRows {
   std::size_t row_size_ = 0;
   Memory kept_;
   std::vector<std::int64_t> index_;  // of the row in each place
-  Room room_;
+  ReadBuffer buffer_;
   bool has_changed_ = false;
   std::mutex mutex_;
 };

@@ -127,7 +127,7 @@ Status CudaWeights::give_places(const ParamList& list, const WeightPlan& plan, C
 Status CudaWeights::fill(const ParamList& list, CudaQueue& queue) const {
   const Content& content = *list.bundle()->content();
   Packer packer;
-  Room room;
+  ReadBuffer buffer;
   for (const Param& param : list.params()) {
     if (param.source == nullptr || is_streamed(param)) continue;
     std::vector<PackPart> parts;
@@ -135,14 +135,14 @@ Status CudaWeights::fill(const ParamList& list, CudaQueue& queue) const {
     if (param.storage == Storage::matrix) {
       MatrixPlace place = place_of(param, (*this)[param]);
       size = place.size_of(param);
-      place.put(param, room.take(size));
+      place.put(param, buffer.take(size));
       add_parts(param, place, parts);
     } else {
-      parts.push_back({.from = param.source->data, .to = room.take(size)});
+      parts.push_back({.from = param.source->data, .to = buffer.take(size)});
     }
     for (const PackPart& part : parts)
       if (!packer.run(content, part)) return content.changed();
-    VLA_CHECK(queue.upload((*this)[param].data, room.take(size), size));
+    VLA_CHECK(queue.upload((*this)[param].data, buffer.take(size), size));
   }
   return {};
 }

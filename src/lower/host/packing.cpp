@@ -72,9 +72,9 @@ void add_parts(const Param& matrix, const MatrixPlace& place, std::vector<PackPa
 
 void Packer::reserve(std::span<const PackPart> parts) {
   for (const PackPart& part : parts) {
-    read_.take(Content::room_for(part.from.size()));
-    scales_.take(Content::room_for(part.from_scales.size()));
-    if (part.recode.changes()) recoded_.take(part.recode.room_for(part.desc.d_in * part.desc.d_out));
+    read_.take(Content::buffer_size(part.from.size()));
+    scales_.take(Content::buffer_size(part.from_scales.size()));
+    if (part.recode.changes()) recoded_.take(part.recode.buffer_size(part.desc.d_in * part.desc.d_out));
   }
 }
 

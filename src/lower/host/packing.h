@@ -57,7 +57,7 @@ class Packer {
   bool run(const Content& content, const PackPart& part);
 
  private:
-  Room read_, scales_, recoded_;
+  ReadBuffer read_, scales_, recoded_;
 };
 
 }  // namespace vla::lower

@@ -23,10 +23,10 @@ void round_to_bf16(DType type, const std::byte* stored, std::int64_t n, std::byt
 
 }  // namespace
 
-const std::byte* Recode::operator()(const std::byte* from, const float* from_scales, std::int64_t count, Room& room,
-                                    float* scales) const {
+const std::byte* Recode::operator()(const std::byte* from, const float* from_scales, std::int64_t count,
+                                    ReadBuffer& buffer, float* scales) const {
   if (!changes()) return from;
-  std::byte* const to = room.take(room_for(count));
+  std::byte* const to = buffer.take(buffer_size(count));
   if (!is_float(stored.type)) {
     assert(stored.group > 0 && wanted.type == DType::f32);
     widen_codes(stored, from, from_scales, count, reinterpret_cast<float*>(to));

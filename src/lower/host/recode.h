@@ -14,14 +14,14 @@ struct Recode {
   Encoding stored, wanted;
 
   bool changes() const { return wanted.type != stored.type; }
-  /// Bytes that `operator()` takes of its room.
-  std::size_t room_for(std::int64_t count) const {
+  /// Bytes that `operator()` takes of its buffer.
+  std::size_t buffer_size(std::int64_t count) const {
     const std::int64_t row = Int4Block::n_of(wanted.group) * Int4Block::kElements;
     return aligned(wanted.size(count)) + static_cast<std::size_t>(row) * sizeof(float);
   }
-  /// `count` elements, whole groups of them, as they are wanted: in `room`, or `from` itself where nothing changes.
+  /// `count` elements, whole groups of them, as they are wanted: in `buffer`, or `from` itself where nothing changes.
   /// from_scales: those of codes that become floats; scales: room for those that codes get.
-  const std::byte* operator()(const std::byte* from, const float* from_scales, std::int64_t count, Room& room,
+  const std::byte* operator()(const std::byte* from, const float* from_scales, std::int64_t count, ReadBuffer& buffer,
                               float* scales) const;
 };
 
