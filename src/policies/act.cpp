@@ -34,6 +34,8 @@ class Act final : public Policy {
   Linear action_out_;
 
  public:
+  static Keys published();
+
   explicit Act(const Scope& s)
       : d_state_(s.dim("d_robot_state")),
         d_environment_(s.index("d_environment_state", 1 << 16)),
@@ -113,7 +115,7 @@ class Act final : public Policy {
 
 /// The published size for ALOHA: two cameras of 640 x 480, 52 M parameters. Source: lerobot
 /// policies/act/configuration_act.py.
-Keys published() {
+Keys Act::published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 14}, {"policy.d_robot_state", 14}, {"policy.d_environment_state", 0},
@@ -129,6 +131,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry act_policy() { return policy_entry<Act>("act", published); }
+PolicyEntry act_policy() { return policy_entry<Act>("act"); }
 
 }  // namespace vla

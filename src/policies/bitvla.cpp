@@ -26,6 +26,8 @@ class BitVla final : public Policy {
   int n_action_token_, d_row_, stop_token_;
 
  public:
+  static Keys published();
+
   explicit BitVla(const Scope& s)
       : vision_(s / "vision", kTernaryEncoder, false),
         lm_(s / "lm", kBitNet),
@@ -80,7 +82,7 @@ class BitVla final : public Policy {
 
 /// hongyuw/ft-bitvla-bitsiglipL-224px-libero_*-bf16: 2.9 B parameters, two views. Source: BitVLA README.md,
 /// transformers configuration_bitnet.py.
-Keys published() {
+Keys BitVla::published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 8}, {"policy.d_action", 7}, {"policy.horizon", 8}, {"policy.max_views", 2},
@@ -95,10 +97,8 @@ Keys published() {
   // clang-format on
 }
 
-std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<BitVla>(Scope(list, "")); }
-
 }  // namespace
 
-PolicyEntry bitvla_policy() { return {"bitvla", make, published}; }
+PolicyEntry bitvla_policy() { return policy_entry<BitVla>("bitvla"); }
 
 }  // namespace vla

@@ -47,6 +47,8 @@ class Evo1 final : public Policy {
   double time_scale_;
 
  public:
+  static Keys published();
+
   explicit Evo1(const Scope& s)
       : vision_(s / "vision"),
         lm_(s / "lm", kQwen2),
@@ -184,7 +186,7 @@ class Evo1 final : public Policy {
 };
 
 /// MINT-SJTU/Evo1_LIBERO: 775 M parameters. Source: Evo-1 Evo_1/config.py, and config.json of OpenGVLab/InternVL3-1B.
-Keys published() {
+Keys Evo1::published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 24}, {"policy.d_action", 24}, {"policy.horizon", 50}, {"policy.d_robot", 7},
@@ -203,6 +205,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry evo1_policy() { return policy_entry<Evo1>("evo1", published); }
+PolicyEntry evo1_policy() { return policy_entry<Evo1>("evo1"); }
 
 }  // namespace vla

@@ -24,6 +24,8 @@ class Gr00tN15 final : public Policy {
   GrootHead head_;
 
  public:
+  static Keys published();
+
   explicit Gr00tN15(const Scope& s)
       : vision_(s / "vision"),
         lm_(s / "lm", kQwen3),
@@ -54,7 +56,7 @@ class Gr00tN15 final : public Policy {
 
 /// nvidia/GR00T-N1.5-3B with two views: 2.1 B parameters for one robot. Sources: Isaac-GR00T
 /// gr00t/model/backbone/eagle2_hg_model/config.json, gr00t/model/action_head/flow_matching_action_head.py.
-Keys published() {
+Keys Gr00tN15::published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 64}, {"policy.d_action", 32}, {"policy.horizon", 16}, {"policy.n_position", 1024},
@@ -73,6 +75,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry gr00t_n1_5_policy() { return policy_entry<Gr00tN15>("gr00t_n1_5", published); }
+PolicyEntry gr00t_n1_5_policy() { return policy_entry<Gr00tN15>("gr00t_n1_5"); }
 
 }  // namespace vla

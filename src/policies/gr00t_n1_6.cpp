@@ -24,6 +24,8 @@ class Gr00tN16 final : public Policy {
   GrootHead head_;
 
  public:
+  static Keys published();
+
   explicit Gr00tN16(const Scope& s)
       : vision_(s / "vision"),
         lm_(s / "lm", kQwen3),
@@ -56,7 +58,7 @@ class Gr00tN16 final : public Policy {
 
 /// nvidia/GR00T-N1.6-3B with two views of 252 x 252: 2.7 B parameters for one robot. Sources: Isaac-GR00T
 /// gr00t/configs/model/gr00t_n1d6.py, gr00t/model/modules/nvidia/Eagle-Block2A-2B-v2/config.json.
-Keys published() {
+Keys Gr00tN16::published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 128}, {"policy.d_action", 128}, {"policy.horizon", 50}, {"policy.n_position", 1024},
@@ -75,6 +77,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry gr00t_n1_6_policy() { return policy_entry<Gr00tN16>("gr00t_n1_6", published); }
+PolicyEntry gr00t_n1_6_policy() { return policy_entry<Gr00tN16>("gr00t_n1_6"); }
 
 }  // namespace vla

@@ -18,6 +18,8 @@ class Gr00tN17 final : public Policy {
   double ramp_rate_;
 
  public:
+  static Keys published();
+
   explicit Gr00tN17(const Scope& s)
       : backbone_(s),
         head_(s, backbone_.d_model(),
@@ -48,7 +50,7 @@ class Gr00tN17 final : public Policy {
 
 /// nvidia/GR00T-N1.7-3B with two views of 256 x 256: 2.8 B parameters for one robot. Sources: Isaac-GR00T
 /// gr00t/configs/model/gr00t_n1d7.py, lerobot policies/groot/groot_n1_7.py.
-Keys published() {
+Keys Gr00tN17::published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 132}, {"policy.d_action", 132}, {"policy.horizon", 40}, {"policy.n_position", 1024},
@@ -69,6 +71,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry gr00t_n1_7_policy() { return policy_entry<Gr00tN17>("gr00t_n1_7", published); }
+PolicyEntry gr00t_n1_7_policy() { return policy_entry<Gr00tN17>("gr00t_n1_7"); }
 
 }  // namespace vla

@@ -22,6 +22,8 @@ class Pi0 final : public Policy {
   TimestepEmbedding time_;                                            // load rate
 
  public:
+  static Keys published();
+
   explicit Pi0(const Scope& s)
       : backbone_(s),
         expert_(s / "expert", backbone_.lm(), ExpertNorm::weighted),
@@ -57,7 +59,7 @@ class Pi0 final : public Policy {
 };
 
 /// lerobot/pi0_base: 3.2 B parameters. Source: lerobot policies/pi0/configuration_pi0.py, get_gemma_config.
-Keys published() {
+Keys Pi0::published() {
   return PaliGemma::published(GemmaExpert::published({{"policy.d_state", 32},
                                                       {"policy.d_action", 32},
                                                       {"policy.horizon", 50},
@@ -67,6 +69,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry pi0_policy() { return policy_entry<Pi0>("pi0", published); }
+PolicyEntry pi0_policy() { return policy_entry<Pi0>("pi0"); }
 
 }  // namespace vla

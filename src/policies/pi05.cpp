@@ -21,6 +21,8 @@ class Pi05 final : public Policy {
   TimestepEmbedding time_;
 
  public:
+  static Keys published();
+
   explicit Pi05(const Scope& s)
       : backbone_(s),
         expert_(s / "expert", backbone_.lm(), ExpertNorm::adaptive),
@@ -52,7 +54,7 @@ class Pi05 final : public Policy {
 };
 
 /// lerobot/pi05_base: 3.4 B parameters. Source: lerobot policies/pi05/configuration_pi05.py, get_gemma_config.
-Keys published() {
+Keys Pi05::published() {
   return PaliGemma::published(GemmaExpert::published({{"policy.d_state", 0},
                                                       {"policy.d_action", 32},
                                                       {"policy.horizon", 50},
@@ -62,6 +64,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry pi05_policy() { return policy_entry<Pi05>("pi05", published); }
+PolicyEntry pi05_policy() { return policy_entry<Pi05>("pi05"); }
 
 }  // namespace vla

@@ -89,9 +89,9 @@ struct PolicyEntry {
 };
 
 template <class P>
-PolicyEntry policy_entry(std::string name, Keys (*published)()) {
+PolicyEntry policy_entry(std::string name) {
   const auto make = [](ParamList& list) -> std::unique_ptr<Policy> { return std::make_unique<P>(Scope(list, "")); };
-  return {std::move(name), make, published};
+  return {std::move(name), make, P::published};
 }
 
 /// Every architecture of src/policies/registry.inc.

@@ -31,6 +31,8 @@ class SmolVla final : public Policy {
   TimestepEmbedding time_;  // load rate
 
  public:
+  static Keys published();
+
   explicit SmolVla(const Scope& s)
       : vision_(s / "vision"),
         lm_(s / "lm", kSmolLm),
@@ -80,7 +82,7 @@ class SmolVla final : public Policy {
 };
 
 /// lerobot/smolvla_base: 450 M parameters. Source: its config.json and that of its backbone.
-Keys published() {
+Keys SmolVla::published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 32}, {"policy.d_action", 32}, {"policy.horizon", 50},
@@ -101,6 +103,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry smolvla_policy() { return policy_entry<SmolVla>("smolvla", published); }
+PolicyEntry smolvla_policy() { return policy_entry<SmolVla>("smolvla"); }
 
 }  // namespace vla

@@ -33,6 +33,8 @@ class TurboVla final : public Policy {
   Linear action_out_;
 
  public:
+  static Keys published();
+
   explicit TurboVla(const Scope& s)
       : d_state_(s.index("d_state", 1 << 16)),
         horizon_(s.dim("horizon", 4096)),
@@ -111,7 +113,7 @@ class TurboVla final : public Policy {
 /// The published size, with LIBERO's robot: two cameras, 0.2 B parameters. Sources: lerobot_policy_turbovla
 /// configuration_turbovla.py, and the configs of facebook/dinov3-vitb16-pretrain-lvd1689m and
 /// google-bert/bert-base-uncased.
-Keys published() {
+Keys TurboVla::published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 8}, {"policy.d_action", 7}, {"policy.horizon", 12}, {"policy.n_view", 2},
@@ -129,6 +131,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry turbovla_policy() { return policy_entry<TurboVla>("turbovla", published); }
+PolicyEntry turbovla_policy() { return policy_entry<TurboVla>("turbovla"); }
 
 }  // namespace vla

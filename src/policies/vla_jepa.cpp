@@ -21,6 +21,8 @@ class VlaJepa final : public Policy {
   int n_embodied_;
 
  public:
+  static Keys published();
+
   /// The language model's last layer is read before the final norm (VLAJEPAModel._qwen_last_decoder_hidden).
   explicit VlaJepa(const Scope& s)
       : backbone_(s),
@@ -58,7 +60,7 @@ class VlaJepa final : public Policy {
 
 /// Qwen3-VL-2B and DiT-B with two views of LIBERO, 224 x 224 as the authors train and 256 x 256 as the backbone's
 /// processor takes them: 2.3 B parameters. Sources: lerobot policies/vla_jepa/configuration_vla_jepa.py, starVLA.
-Keys published() {
+Keys VlaJepa::published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 8}, {"policy.d_action", 7}, {"policy.horizon", 7}, {"policy.n_position", 1024},
@@ -79,6 +81,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry vla_jepa_policy() { return policy_entry<VlaJepa>("vla_jepa", published); }
+PolicyEntry vla_jepa_policy() { return policy_entry<VlaJepa>("vla_jepa"); }
 
 }  // namespace vla

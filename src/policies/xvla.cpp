@@ -42,6 +42,8 @@ class XVla final : public Policy {
   Linear action_out_;
 
  public:
+  static Keys published();
+
   explicit XVla(const Scope& s)
       : d_state_(s.index("d_state", 1 << 16)),
         horizon_(s.dim("horizon", 4096)),
@@ -198,7 +200,7 @@ class XVla final : public Policy {
 
 /// The published size with three views: 0.9 B parameters of one domain. Sources: lerobot configuration_xvla.py and the
 /// config of lerobot/xvla-base, whose backbone is Florence-2 large.
-Keys published() {
+Keys XVla::published() {
   using Sizes = std::vector<std::int64_t>;
   // clang-format off
   return Keys({
@@ -220,6 +222,6 @@ Keys published() {
 
 }  // namespace
 
-PolicyEntry xvla_policy() { return policy_entry<XVla>("xvla", published); }
+PolicyEntry xvla_policy() { return policy_entry<XVla>("xvla"); }
 
 }  // namespace vla

@@ -8,6 +8,8 @@
 
 namespace vla {
 
+constexpr std::int64_t kPartRows = 64;  // of a matrix that are in memory at a time
+
 /// Makes the codes of a matrix, some rows at a time.
 class CodeMaker {
  public:

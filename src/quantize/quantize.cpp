@@ -18,8 +18,6 @@
 namespace vla {
 namespace {
 
-constexpr std::int64_t kPartRows = 64;  // of a matrix that are in memory at a time
-
 /// Tensors of the file by the address of their bytes, which the robots of a bundle share.
 struct Matrices {
   std::map<const std::byte*, Encoding> wanted;

@@ -12,12 +12,12 @@
 #include "base/file.h"
 #include "bundle/gguf_writer.h"
 #include "kernels/numbers.h"
+#include "quantize/code_maker.h"
 #include "quantize/smoothing_places.h"
 
 namespace vla {
 namespace {
 
-constexpr std::int64_t kPartRows = 64;  // of a matrix that are in memory at a time
 // Powers of two of a factor. Channels that stand out less are left, since weights of four bits lose more by a factor
 // than activations of eight gain.
 constexpr int kLeastPower = 2, kMostPower = 12;
