@@ -166,17 +166,8 @@ Result<StagePredictions> Engine::predict() {
 
 Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise,
                                 const std::optional<Leftover>& leftover) noexcept {
-  VLA_CHECK(encode(observation, noise, leftover, prepared_));
-  return act(prepared_);
-}
-
-Status Engine::prepare(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
-                       EncodedObservation& to) const noexcept try {
-  VLA_CHECK(encode(observation, noise, leftover, to));
-  to.pixels_ahead = device_->send(to.inputs.pixels.data(), to.inputs.pixels.size() * sizeof(float));
-  return {};
-} catch (const std::bad_alloc&) {
-  return no_memory();
+  VLA_CHECK(encode(observation, noise, leftover, encoded_));
+  return compute(encoded_);
 }
 
 Status Engine::encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
@@ -189,8 +180,16 @@ Status Engine::encode(const Observation& observation, const Noise& noise, const 
   return no_memory();
 }
 
-Result<ActionChunk> Engine::act(EncodedObservation& prepared) noexcept try {
-  return run(prepared);
+Status Engine::send_ahead(EncodedObservation& encoded) const noexcept try {
+  const std::vector<float>& pixels = encoded.inputs.pixels;
+  encoded.pixels_ahead = device_->send(pixels.data(), pixels.size() * sizeof(float));
+  return {};
+} catch (const std::bad_alloc&) {
+  return no_memory();
+}
+
+Result<ActionChunk> Engine::compute(EncodedObservation& encoded) noexcept try {
+  return run(encoded);
 } catch (const std::bad_alloc&) {
   return no_memory();
 }
@@ -223,15 +222,15 @@ Status Engine::solve(Plan& plan, int n_step, std::vector<Tap>& taps) {
   return {};
 }
 
-Result<ActionChunk> Engine::run(EncodedObservation& observation) {
-  const Robot& robot = *observation.robot;
-  const Inputs& in = observation.inputs;
+Result<ActionChunk> Engine::run(EncodedObservation& encoded) {
+  const Robot& robot = *encoded.robot;
+  const Inputs& in = encoded.inputs;
   StageClock clock;
-  Timing timing = std::move(observation.timing);
+  Timing timing = std::move(encoded.timing);
   std::vector<Tap> taps;
-  last_ = {&robot, robot.shape_of(observation)};
+  last_ = {&robot, robot.shape_of(encoded)};
   VLA_TRY(Plan * plan, plans_->for_shape(robot.network(), last_->second));
-  set_inputs(*plan, observation);
+  set_inputs(*plan, encoded);
   record(taps, "pixels", {in.width, in.height, 3, in.n_view}, in.pixels);
   if (!in.tokens.empty()) record(taps, "tokens", {static_cast<std::int64_t>(in.tokens.size())}, in.tokens);
   if (!in.state.empty()) record(taps, "state", {static_cast<std::int64_t>(in.state.size())}, in.state);
@@ -239,7 +238,7 @@ Result<ActionChunk> Engine::run(EncodedObservation& observation) {
   VLA_CHECK(solve(*plan, robot.solver().n_step, taps));
   const std::vector<float> x = plan->x();  // other devices than the CPU are waited for here
   VLA_CHECK(device_->failure());
-  observation.pixels_ahead.reset();
+  encoded.pixels_ahead.reset();
   for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(timing, stage.name, stage.done);
   clock.lap(timing, "prefix", plan->prefix_ended());
   clock.lap(timing, "steps");

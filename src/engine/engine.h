@@ -70,12 +70,14 @@ class Engine {
   /// out), unsupported, device, out_of_memory.
   Result<ActionChunk> act(const Observation& observation, const Noise& noise,
                           const std::optional<Leftover>& leftover = {}) noexcept;
-  /// The two halves of it: the host's, and the device's with unnormalization. Any thread may prepare an observation
-  /// while another one acts; its images then go to the device meanwhile. Errors: of the first bad_observation,
-  /// unsupported and out_of_memory.
-  Status prepare(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
-                 EncodedObservation& to) const noexcept;
-  Result<ActionChunk> act(EncodedObservation& prepared) noexcept;
+  /// The halves of an act. The host's: any thread may encode while another one computes. Errors: bad_observation,
+  /// unsupported, out_of_memory.
+  Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
+                EncodedObservation& to) const noexcept;
+  /// The device's, with unnormalization. Errors: those of `act`.
+  Result<ActionChunk> compute(EncodedObservation& encoded) noexcept;
+  /// Between them: the images go to the device while it computes another act. Errors: out_of_memory.
+  Status send_ahead(EncodedObservation& encoded) const noexcept;
 
   /// Of the last act: whose, and of which size. None before the first.
   std::optional<ActShape> last_shape() const;
@@ -130,10 +132,8 @@ class Engine {
   Status build(const WeightPlan& plan, bool dry);
   Result<WeightPlan> plan_weights(std::size_t budget);
   Status make_plans(bool dry);
-  Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
-                EncodedObservation& to) const noexcept;
   Status inject_inputs(Inputs& inputs) const;
-  Result<ActionChunk> run(EncodedObservation& observation);
+  Result<ActionChunk> run(EncodedObservation& encoded);
   Status solve(Plan& plan, int n_step, std::vector<Tap>& taps);
   template <class T>
   void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
@@ -150,7 +150,7 @@ class Engine {
   std::optional<Plans> plans_;
   std::optional<std::pair<const Robot*, InputShape>> last_;
   MemoryBudget budget_;
-  EncodedObservation prepared_;  // of the last observation that came to `act` as a whole
+  EncodedObservation encoded_;  // of the last observation that came to `act` as a whole
 };
 
 }  // namespace vla

@@ -129,9 +129,10 @@ Result<double> warm_up(Engine& engine, const std::vector<ActShape>& sizes) {
     return error.code == Code::bad_observation || error.code == Code::bad_action;
   };
   for (const Robot* robot : engine.robots()) {
-    EncodedObservation prepared;  // its memory is not kept: every act that is served brings its own
-    const Status valid = engine.prepare(largest_observation(*robot), Noise(std::uint64_t{0}), {}, prepared);
-    const auto chunk = valid ? engine.act(prepared) : Result<ActionChunk>(valid.error());
+    EncodedObservation encoded;  // its memory is not kept: every act that is served brings its own
+    Status valid = engine.encode(largest_observation(*robot), Noise(std::uint64_t{0}), {}, encoded);
+    if (valid) valid = engine.send_ahead(encoded);
+    const auto chunk = valid ? engine.compute(encoded) : Result<ActionChunk>(valid.error());
     if (!chunk && !is_refused(chunk.error())) return chunk.error();
   }
   for (const ActShape& size : sizes)
@@ -325,8 +326,9 @@ Status Server::prepare(Act& act) const {
   VLA_TRY(act.request, act.answer.job.call->decode(act.policy()));
   act.request.observation.reject_out_of_range = options_.strict_state;
   act.clock.lap(act.answer.stages, "decode");
-  VLA_CHECK(
-      act.policy().engine->prepare(act.request.observation, act.request.noise, act.request.leftover, act.encoded()));
+  const Engine& engine = *act.policy().engine;
+  VLA_CHECK(engine.encode(act.request.observation, act.request.noise, act.request.leftover, act.encoded()));
+  VLA_CHECK(engine.send_ahead(act.encoded()));
   act.clock = {};  // the wait for the device begins
   return {};
 }
@@ -335,7 +337,7 @@ Status Server::respond(Act& act) const {
   Answer& answer = act.answer;
   const ServedPolicy& policy = act.policy();
   if (!policy.engine->device().is_host()) act.clock.lap(act.encoded().timing, "wait");
-  VLA_TRY(ActionChunk chunk, policy.engine->act(act.encoded()));
+  VLA_TRY(ActionChunk chunk, policy.engine->compute(act.encoded()));
   answer.stages.insert(answer.stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = answer.stages;
   answer.out_of_range = chunk.out_of_range, answer.notes = chunk.notes;

@@ -62,6 +62,12 @@ Counts calls_since(const Counts& before) {
 const Counts kAct = {
     {"cuMemcpyHtoDAsync_v2", 1}, {"cuGraphLaunch", 1}, {"cuMemcpyDtoHAsync_v2", 1}, {"cuStreamSynchronize", 1}};
 
+/// As the server does it, while the act before is computed.
+Status encode(const Engine& engine, const GoldenCase& golden, EncodedObservation& to) {
+  VLA_CHECK(engine.encode(golden.observation, golden.noise, {}, to));
+  return engine.send_ahead(to);
+}
+
 /// Everything that a program does with a policy: the first error, or none. A server prepares an act before the one
 /// before is computed.
 Status load_and_act(const GoldenCase& golden) {
@@ -75,9 +81,9 @@ Status load_and_act(const GoldenCase& golden) {
     if (!chunk && first) first = chunk.error();
   };
   for (int i = 0; i < 2; ++i) check(engine->act(golden.observation, golden.noise));
-  EncodedObservation prepared[2];
-  for (EncodedObservation& one : prepared) VLA_CHECK(engine->prepare(golden.observation, golden.noise, {}, one));
-  for (EncodedObservation& one : prepared) check(engine->act(one));
+  EncodedObservation encoded[2];
+  for (EncodedObservation& one : encoded) VLA_CHECK(encode(*engine, golden, one));
+  for (EncodedObservation& one : encoded) check(engine->compute(one));
   return first;
 }
 
@@ -179,7 +185,7 @@ TEST_CASE_FIXTURE(Driver, "images of an act that is prepared travel before the a
   const GoldenCase golden = small_case();
   const auto engine = load_engine(golden.bundle(), "", "float32");
   EncodedObservation acts[2];
-  const auto prepare = [&](int i) { REQUIRE(engine->prepare(golden.observation, golden.noise, {}, acts[i % 2])); };
+  const auto prepare = [&](int i) { REQUIRE(encode(*engine, golden, acts[i % 2]).ok()); };
   prepare(0);
   for (int i = 0; i < 5; ++i) {
     Counts before = fake_driver().n_call;
@@ -187,7 +193,7 @@ TEST_CASE_FIXTURE(Driver, "images of an act that is prepared travel before the a
     const Counts sent = {{"cuMemcpyHtoDAsync_v2", 1}, {"cuEventRecord", 1}};
     if (i > 0) CHECK(calls_since(before) == sent);
     before = fake_driver().n_call;
-    REQUIRE(engine->act(acts[i % 2]).ok());
+    REQUIRE(engine->compute(acts[i % 2]).ok());
     Counts computed = kAct;  // the upload is of what is small
     computed["cuStreamWaitEvent"] = computed["cuMemcpyDtoDAsync_v2"] = 1;
     if (i > 1) CHECK(calls_since(before) == computed);
@@ -205,32 +211,29 @@ TEST_CASE_FIXTURE(Driver, "acts that another thread prepares meanwhile answer wh
   const std::vector<float> expected[2] = {alone(golden), alone(dark)};
   CHECK(expected[0] != expected[1]);
   EncodedObservation acts[2];
-  const auto prepare = [&](int i) {
-    const GoldenCase& one = i % 2 == 0 ? golden : dark;
-    return engine->prepare(one.observation, one.noise, {}, acts[i % 2]).ok();
-  };
+  const auto prepare = [&](int i) { return encode(*engine, i % 2 == 0 ? golden : dark, acts[i % 2]).ok(); };
   REQUIRE(prepare(0));
   for (int i = 0; i < 4; ++i) {
     auto next = std::async(std::launch::async, prepare, i + 1);
-    const auto chunk = engine->act(acts[i % 2]);
+    const auto chunk = engine->compute(acts[i % 2]);
     REQUIRE(next.get());
     REQUIRE_MESSAGE(chunk.ok(), (chunk ? "" : chunk.error().message()));
     CHECK(chunk->actions == expected[i % 2]);
   }
   for (int i = 0; i < 6; ++i) {  // at once: the images are still on their way
     REQUIRE(prepare(i));
-    CHECK(engine->act(acts[i % 2])->actions == expected[i % 2]);
+    CHECK(engine->compute(acts[i % 2])->actions == expected[i % 2]);
   }
   // One that nobody computes leaves its memory to the next, and one for which memory is short is uploaded in its turn.
   REQUIRE(prepare(1));
   REQUIRE(prepare(1));
-  CHECK(engine->act(acts[1])->actions == expected[1]);
+  CHECK(engine->compute(acts[1])->actions == expected[1]);
   EncodedObservation third;
   fake_driver().memory = fake_driver().used;
   REQUIRE((prepare(0) && prepare(1)));
-  REQUIRE(engine->prepare(golden.observation, golden.noise, {}, third));
+  REQUIRE(encode(*engine, golden, third).ok());
   CHECK(third.pixels_ahead == nullptr);
-  CHECK(engine->act(third)->actions == expected[0]);
+  CHECK(engine->compute(third)->actions == expected[0]);
 }
 
 TEST_CASE_FIXTURE(Driver, "stages have the device's times, one after the other") {

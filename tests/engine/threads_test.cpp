@@ -35,8 +35,8 @@ TEST_CASE("while one thread acts two others prepare for either robot, and no ans
 
   std::array<std::array<EncodedObservation, 2>, 2> turns;  // of one round, and of the next
   const auto prepare = [&](int round, std::size_t robot) {
-    return engine.prepare(observation(round, robot == 0 ? "arm" : "dog"), golden.noise, {},
-                          turns[static_cast<std::size_t>(round) % 2][robot]);
+    return engine.encode(observation(round, robot == 0 ? "arm" : "dog"), golden.noise, {},
+                         turns[static_cast<std::size_t>(round) % 2][robot]);
   };
   REQUIRE(prepare(0, 0).ok());
   REQUIRE(prepare(0, 1).ok());
@@ -44,8 +44,8 @@ TEST_CASE("while one thread acts two others prepare for either robot, and no ans
     CAPTURE(round);
     Status arm, dog;
     std::thread of_arm([&] { arm = prepare(round + 1, 0); }), of_dog([&] { dog = prepare(round + 1, 1); });
-    for (EncodedObservation& prepared : turns[static_cast<std::size_t>(round) % 2]) {
-      const auto chunk = engine.act(prepared);
+    for (EncodedObservation& encoded : turns[static_cast<std::size_t>(round) % 2]) {
+      const auto chunk = engine.compute(encoded);
       CHECK(chunk.ok());
       if (chunk) CHECK(chunk->actions == expected[static_cast<std::size_t>(round % 3)]);
     }
