@@ -7,7 +7,7 @@
 
 #include <cmath>
 
-#include "processor/ops/pipeline.h"
+#include "processor/ops/op.h"
 
 namespace vla::bench {
 namespace {
@@ -82,7 +82,7 @@ Result<Workload> Workload::make(const Processor& processor, const WorkloadSizes&
                  fmt::format("{} to {}, which the bundle allows", processor.min_views(), views.size()),
                  std::to_string(n_view)};
   const Recipe& recipe = processor.recipe();
-  const CameraSize camera = camera_size(*recipe.fit).value_or(CameraSize{recipe.width, recipe.height});
+  const CameraSize camera = recipe.fit->camera_size().value_or(CameraSize{recipe.width, recipe.height});
   workload.width_ = sizes.width > 0 ? sizes.width : camera.width;
   workload.height_ = sizes.height > 0 ? sizes.height : camera.height;
   for (int i = 0; i < static_cast<int>(views.size()); ++i) {

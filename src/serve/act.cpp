@@ -6,7 +6,7 @@
 
 #include <random>
 
-#include "processor/ops/pipeline.h"
+#include "processor/ops/op.h"
 
 namespace vla::serve {
 
@@ -26,7 +26,7 @@ ActLimits act_limits(const ServerOptions& options, const Robot& robot) {
 }
 
 Status spend(ActLimits& left, int width, int height, std::int64_t work, const std::string& where) {
-  if (left.fit != nullptr) work += fit_work(*left.fit, width, height);
+  if (left.fit != nullptr) work += left.fit->work(width, height);
   if (work > left.max_pixels)
     return Error{Code::too_large, where, fmt::format("an image that costs at most {} pixels", left.max_pixels),
                  fmt::format("{} x {}, which costs {}", width, height, work), "Description.limits has all limits"};

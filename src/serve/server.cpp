@@ -16,7 +16,7 @@
 #include "base/out_of_memory.h"
 #include "base/thread.h"
 #include "net/descriptors.h"
-#include "processor/ops/pipeline.h"
+#include "processor/ops/op.h"
 #include "serve/door/front.h"
 #include "serve/double_buffer.h"
 #include "serve/gr00t/front.h"
@@ -109,7 +109,7 @@ std::string longest_text(const Processor& processor, Observation observation) {
 Observation largest_observation(const Robot& robot) {
   const Processor& processor = robot.processor();
   const Recipe& recipe = processor.recipe();
-  const auto [width, height] = camera_size(*recipe.fit).value_or(CameraSize{recipe.width, recipe.height});
+  const auto [width, height] = recipe.fit->camera_size().value_or(CameraSize{recipe.width, recipe.height});
   const std::vector<std::uint8_t> grey(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3, 128);
   Observation observation;
   for (const std::string& view : processor.views().names()) observation.views.emplace(view, Frame{width, height, grey});

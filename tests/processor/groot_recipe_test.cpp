@@ -65,7 +65,7 @@ TEST_CASE("ops on images of any size cost half of the pixels that they read") {
   const Pipeline pipeline{4, 4, {SquarePad{}, SmallestSide{8}, CropFraction{0.5}}};
   CHECK(pipeline_work(pipeline, 20, 10) == (20 * 10 + 20 * 20 + 8 * 8) / 2);
   CHECK(pipeline_work({4, 4, {SmallestSide{4096}, SmallestSide{4096}}}, 1, 16384) > std::int64_t{1} << 35);
-  CHECK(fit_work(*make(groot()).recipe().fit, 20, 10) == (20 * 10 + 20 * 20 + 4 * 4) / 2);
+  CHECK(make(groot()).recipe().fit->work(20, 10) == (20 * 10 + 20 * 20 + 4 * 4) / 2);
 }
 
 TEST_CASE("text is lower-cased and cleaned as Python does it") {

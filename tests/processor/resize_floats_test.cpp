@@ -76,7 +76,7 @@ TEST_CASE("a frame of another camera is refused, and the camera's size is told")
   op.update(from);
   const auto recipe = parsed(Json::array({op}));
   REQUIRE_MESSAGE(recipe.ok(), recipe.error().message());
-  const auto camera = camera_size(*recipe->fit);
+  const auto camera = recipe->fit->camera_size();
   REQUIRE(camera);
   CHECK(camera->width == 6);
   CHECK(camera->height == 4);
@@ -92,7 +92,7 @@ TEST_CASE("sizes follow each other, of the last one are the network's images") {
   REQUIRE_MESSAGE(recipe.ok(), recipe.error().message());
   CHECK(recipe->width == 8);
   CHECK(recipe->height == 6);
-  CHECK_FALSE(camera_size(*recipe->fit));
+  CHECK_FALSE(recipe->fit->camera_size());
 }
 
 TEST_CASE("what the document does not say of resize_floats is refused") {

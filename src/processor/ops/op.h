@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <cstdint>
+#include <optional>
 #include <set>
 #include <span>
 #include <string>
@@ -30,18 +32,28 @@ struct OpEntry {
 };
 using Ops = std::vector<OpEntry>;
 
+/// The size of a camera's frames.
+struct CameraSize {
+  int width = 0;
+  int height = 0;
+};
+
 /// Makes planes of the network's size from a frame of any size.
 class Fit {
  public:
   virtual ~Fit() = default;
   virtual const char* described() const = 0;
+  /// The only frames that are taken, where the recipe says so.
+  virtual std::optional<CameraSize> camera_size() const { return {}; }
+  /// What it computes beside making the planes, for a frame of this size, in pixels of about 10 ns.
+  virtual std::int64_t work(int /*width*/, int /*height*/) const { return 0; }
   /// Writes (3, height, width) float32 in [0, 1]. Errors: bad_observation, at `where`.
   virtual Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const = 0;
 };
 
 /// A fit by one function of what the recipe says.
 template <class Op>
-class OneFit final : public Fit {
+class OneFit : public Fit {
  public:
   using Run = Status(const Frame& frame, const Op& op, std::span<float> planes, const std::string& where);
 

@@ -10,7 +10,6 @@
 #include "processor/byte_pixels.h"
 #include "processor/image_codecs.h"
 #include "processor/json_fields.h"
-#include "processor/ops/resize_floats.h"
 #include "processor/recipe.h"
 #include "processor/resample.h"
 
@@ -160,19 +159,6 @@ Status check_camera(const Frame& frame, const CameraSize& camera, const std::str
                "this policy takes the images of the cameras that it was trained with"};
 }
 
-std::optional<CameraSize> camera_size(const Fit& fit) {
-  if (const auto* const floats = dynamic_cast<const OneFit<FloatResizes>*>(&fit)) return floats->op.camera;
-  if (const auto* const pipeline = dynamic_cast<const OneFit<Pipeline>*>(&fit))
-    for (const ByteOp& op : pipeline->op.ops)
-      if (const auto* camera = std::get_if<CameraSize>(&op)) return *camera;
-  return {};
-}
-
-std::int64_t fit_work(const Fit& fit, int width, int height) {
-  const auto* const pipeline = dynamic_cast<const OneFit<Pipeline>*>(&fit);
-  return pipeline != nullptr ? pipeline_work(pipeline->op, width, height) : 0;
-}
-
 std::int64_t pipeline_work(const Pipeline& pipeline, int width, int height) {
   constexpr double kMost = 1e15;  // in place of what a sliver of an image would become
   constexpr double kJpeg = 4.0;   // both ways
@@ -189,12 +175,21 @@ namespace {
 
 constexpr std::size_t kMaxByteOps = 16;
 
+struct PipelineFit final : OneFit<Pipeline> {
+  PipelineFit() : OneFit("padded, scaled and cropped as the recipe says", run_pipeline) {}
+  std::optional<CameraSize> camera_size() const override {
+    for (const ByteOp& each : op.ops)
+      if (const auto* camera = std::get_if<CameraSize>(&each)) return *camera;
+    return {};
+  }
+  std::int64_t work(int width, int height) const override { return pipeline_work(op, width, height); }
+};
+
 /// The pipeline that the next op belongs to.
 Result<Pipeline*> open_pipeline(const JsonFields& fields, Recipe& recipe) {
   if (recipe.width > 0) return misplaced(fields, "images of any size before size, letterbox or resize");
-  if (recipe.fit == nullptr)
-    recipe.fit = std::make_unique<OneFit<Pipeline>>("padded, scaled and cropped as the recipe says", run_pipeline);
-  return &static_cast<OneFit<Pipeline>&>(*recipe.fit).op;  // every other fit has stated the size
+  if (recipe.fit == nullptr) recipe.fit = std::make_unique<PipelineFit>();
+  return &static_cast<PipelineFit&>(*recipe.fit).op;  // every other fit has stated the size
 }
 
 Status add(const JsonFields& fields, Recipe& recipe, ByteOp op) {

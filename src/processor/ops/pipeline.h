@@ -36,12 +36,6 @@ struct ByteResize {
   Filter filter = Filter::pillow_bicubic;
 };
 
-/// Frames of one size only.
-struct CameraSize {
-  int width = 0;
-  int height = 0;
-};
-
 /// The middle of an image, no larger than it; of an odd rest that is cut off the half is rounded to even.
 struct CenterCrop {
   int width = 0;
@@ -82,13 +76,8 @@ struct Pipeline {
 /// Errors: bad_observation.
 Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where);
 
-/// The work of a fit with a frame of this size, counted in pixels of about 10 ns; 0 where it depends on the size it
-/// makes.
-std::int64_t fit_work(const Fit& fit, int width, int height);
 /// Checks that a frame is of the camera whose frames alone are taken. Errors: bad_observation.
 Status check_camera(const Frame& frame, const CameraSize& camera, const std::string& where);
-/// The size of frames where only one is taken.
-std::optional<CameraSize> camera_size(const Fit& fit);
 /// Half a pixel for each that an op reads.
 std::int64_t pipeline_work(const Pipeline& pipeline, int width, int height);
 

@@ -6,6 +6,7 @@
 
 #include "processor/byte_pixels.h"
 #include "processor/json_fields.h"
+#include "processor/ops/pipeline.h"
 #include "processor/recipe.h"
 #include "processor/resample.h"
 
@@ -44,6 +45,11 @@ namespace {
 constexpr int kMinSide = 2;  // torch reads the wrong rows for an image of one column
 constexpr std::size_t kMaxSizes = 4;
 
+struct FloatFit final : OneFit<FloatResizes> {
+  FloatFit() : OneFit("resized", resize_floats) {}
+  std::optional<CameraSize> camera_size() const override { return op.camera; }
+};
+
 Result<FloatResize> read_size(JsonFields& fields) {
   FloatResize op;
   VLA_TRY(op.width, fields.integer("width", kMinSide, kMaxImageSide));
@@ -57,13 +63,13 @@ Result<FloatResize> read_size(JsonFields& fields) {
 
 /// Several in a row are one fit. The first may say of which cameras the frames are.
 Status parse(JsonFields& fields, Recipe& recipe) {
-  auto* fit = dynamic_cast<OneFit<FloatResizes>*>(recipe.fit.get());
+  auto* fit = dynamic_cast<FloatFit*>(recipe.fit.get());
   if ((recipe.fit != nullptr && fit == nullptr) || !recipe.image.empty())
     return misplaced(fields, "resize_floats as the first ops on images");
   if (fit != nullptr && fit->op.sizes.size() == kMaxSizes) return misplaced(fields, "fewer sizes");
   VLA_TRY(const FloatResize size, read_size(fields));
   if (fit == nullptr) {
-    auto first = std::make_unique<OneFit<FloatResizes>>("resized", resize_floats);
+    auto first = std::make_unique<FloatFit>();
     fit = first.get();
     recipe.fit = std::move(first);
     if (fields.has("from_width")) {

@@ -9,7 +9,7 @@
 
 #include "base/result.h"
 #include "processor/image.h"
-#include "processor/ops/pipeline.h"
+#include "processor/ops/op.h"
 
 namespace vla {
 
