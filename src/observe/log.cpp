@@ -12,7 +12,7 @@
 namespace vla::serve {
 namespace {
 
-constexpr std::size_t kMaxWaiting = 1 << 20;
+constexpr std::size_t kMaxLogBacklog = 1 << 20;
 constexpr auto kNoteAgain = std::chrono::minutes(1);
 constexpr std::size_t kMaxNoted = 1024;
 constexpr double kBurst = 200, kPerSecond = 50;  // lines about clients
@@ -62,7 +62,7 @@ double ms(Clock::duration time) { return std::chrono::duration<double, std::mill
 }  // namespace
 
 Log::Log(int fd, LogFormat format, Level min_level)
-    : format_(format), min_level_(min_level), writer_(fd, Writer::Owns::no, kMaxWaiting), allowance_(kBurst) {}
+    : format_(format), min_level_(min_level), writer_(fd, Writer::Owns::no, kMaxLogBacklog), allowance_(kBurst) {}
 
 /// Whoever is refused can ask again at once: its lines must not fill the disk.
 bool Log::may_tell() {

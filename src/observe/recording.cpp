@@ -16,7 +16,7 @@ namespace {
 
 constexpr std::string_view kMagic = "VLAREC2\n";
 constexpr std::size_t kHead = 40, kSealed = 32;  // bytes of a record before its request; of them under the checksum
-constexpr std::size_t kMaxWaiting = 128 << 20;
+constexpr std::size_t kMaxRecordBacklog = 128 << 20;
 
 using Head = std::array<char, kHead>;
 
@@ -77,7 +77,7 @@ Recorder::Recorder(std::string path, int fd, std::uint64_t max_bytes)
       max_bytes_(max_bytes),
       epoch_(std::chrono::system_clock::now().time_since_epoch() - Clock::now().time_since_epoch()),
       bytes_(kMagic.size() + kHead),
-      writer_(fd, Writer::Owns::yes, kMaxWaiting) {
+      writer_(fd, Writer::Owns::yes, kMaxRecordBacklog) {
   writer_.put(std::string(kMagic));
 }
 

@@ -12,7 +12,7 @@
 namespace vla::serve {
 namespace {
 
-constexpr std::size_t kMaxWaiting = 16 << 20;
+constexpr std::size_t kMaxTraceBacklog = 16 << 20;
 constexpr int kIo = 1, kEngine = 2, kHost = 3;  // tracks
 
 /// Trace events count in microseconds; three digits keep the nanoseconds, so that what nests still nests.
@@ -70,7 +70,7 @@ Result<std::unique_ptr<Trace>> Trace::open(const std::string& path, std::size_t 
   return trace;
 }
 
-Trace::Trace(int fd, std::size_t max_bytes) : max_bytes_(max_bytes), writer_(fd, Writer::Owns::yes, kMaxWaiting) {
+Trace::Trace(int fd, std::size_t max_bytes) : max_bytes_(max_bytes), writer_(fd, Writer::Owns::yes, kMaxTraceBacklog) {
   writer_.put("[\n" + name_of_thread(kIo, "requests") + ",\n" + name_of_thread(kEngine, "engine") + ",\n" +
               name_of_thread(kHost, "host, beside a device") + ",\n");
 }

@@ -16,7 +16,7 @@ namespace vla::lower {
 namespace {
 
 /// Parts of parameters on their way to memory, an item each.
-struct PackTask : kernels::Task {
+struct PackMatrixTask : kernels::Task {
   const Content* content;
   std::vector<PackPart> parts;
   mutable std::vector<Packer> packers;  // of each worker
@@ -118,7 +118,7 @@ Status CpuWeights::give_places(const ParamList& list, const Options& options, co
 
 /// Reads what is resident.
 Status CpuWeights::fill(const ParamList& list, const WeightPlan& plan, int n_thread) const {
-  PackTask task;
+  PackMatrixTask task;
   for (const Param& param : list.params()) {
     if (param.storage == Storage::table || is_streamed(param)) continue;
     if (param.storage == Storage::matrix)
