@@ -26,9 +26,17 @@ Conditions conditions_of(const Engine& engine, const Workload& workload, int n_s
   const auto text = [&](const char* key) {
     return *engine.robot().bundle().keys().string(key);
   };  // every bundle has them
-  return {text("vla.arch"),           text("vla.dtype"), text("vla.source.name"), workload.n_view(),
-          workload.width(),           workload.height(), workload.n_text(),       n_step,
-          engine.device().n_thread(), engine.kernels(),  engine.device().name()};
+  return {.policy = text("vla.arch"),
+          .weights = text("vla.dtype"),
+          .source = text("vla.source.name"),
+          .n_view = workload.n_view(),
+          .width = workload.width(),
+          .height = workload.height(),
+          .n_text = workload.n_text(),
+          .n_step = n_step,
+          .n_thread = engine.device().n_thread(),
+          .kernels = engine.kernels(),
+          .device = engine.device().name()};
 }
 
 /// Rounds of every number of steps.

@@ -24,7 +24,8 @@ double time_at(const Work& work, double peak, double int8_peak) {
 
 /// One row from the times and the work of each round.
 StageRow make_row(const std::string& name, const std::vector<double>& times, const Work& work, const Report& report) {
-  StageRow row{name, quantile(times, 0.5), quantile(times, 0.9), quantile(times, 0), work};
+  StageRow row{
+      .name = name, .p50 = quantile(times, 0.5), .p90 = quantile(times, 0.9), .min = quantile(times, 0), .work = work};
   if (row.p50 <= 0) return row;
   row.flop_rate = work.flop / (1e-3 * row.p50);
   row.byte_rate = work.bytes / (1e-3 * row.p50);

@@ -67,10 +67,18 @@ Status wait_for_line() {
 
 Status run_bench(const BenchOptions& options) {
   VLA_CHECK(check(options));
-  bench::Request request{options.bundle,  options.arch,    dtype_of(options.dtype), {},
-                         options.steps,   options.n_round, options.n_warmup,        options.n_thread,
-                         options.kernels, options.device,  options.embodiment,      options.memory};
-  request.sizes = {options.n_view, 0, 0, options.n_text};
+  bench::Request request{.bundle = options.bundle,
+                         .arch = options.arch,
+                         .dtype = dtype_of(options.dtype),
+                         .sizes = {options.n_view, 0, 0, options.n_text},
+                         .steps = options.steps,
+                         .n_round = options.n_round,
+                         .n_warmup = options.n_warmup,
+                         .n_thread = options.n_thread,
+                         .kernels = options.kernels,
+                         .device = options.device,
+                         .embodiment = options.embodiment,
+                         .memory = options.memory};
   if (!options.image_size.empty()) VLA_CHECK(parse_size(options.image_size, request.sizes));
   if (!options.model.empty()) {
     VLA_TRY(const bench::GpuPrediction prediction, bench::predict(request, options.model));

@@ -82,19 +82,23 @@ Status Robot::set_steps(int n_step, Device& device, bool dry) {
 InputShape Robot::largest_shape() const {
   const Recipe& recipe = processor_.recipe();
   const int n_view = static_cast<int>(processor_.views().names().size());
-  return {recipe.width,      recipe.height, n_view,
-          recipe.max_tokens, d_state_,      view_key(static_cast<std::uint32_t>((std::uint64_t{1} << n_view) - 1))};
+  return {.width = recipe.width,
+          .height = recipe.height,
+          .n_view = n_view,
+          .n_text = recipe.max_tokens,
+          .d_state = d_state_,
+          .views = view_key(static_cast<std::uint32_t>((std::uint64_t{1} << n_view) - 1))};
 }
 
 InputShape Robot::shape_of(const EncodedObservation& observation) const {
   const Inputs& in = observation.inputs;
-  return {in.width,
-          in.height,
-          in.n_view,
-          static_cast<int>(in.tokens.size()),
-          d_state_,
-          view_key(in.views),
-          observation.steering.has_value()};
+  return {.width = in.width,
+          .height = in.height,
+          .n_view = in.n_view,
+          .n_text = static_cast<int>(in.tokens.size()),
+          .d_state = d_state_,
+          .views = view_key(in.views),
+          .steered = observation.steering.has_value()};
 }
 
 /// The views of a shape: shapes that are the same for the policy must be equal.

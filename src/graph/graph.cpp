@@ -32,9 +32,11 @@ Tensor Graph::add(Op op, std::vector<Tensor> in, const Shape& shape) {
     for (Tensor tensor : in) operands.push_back(tensor ? shape_text(tensor.shape()) : "none");
     problem_ = fmt::format("{} {} of {}: operands do not fit", op_name(op), nodes_.size(), fmt::join(operands, ", "));
   }
-  const DType type = check.type;
-  return Tensor(&nodes_.emplace_back(
-      Node{static_cast<int>(nodes_.size()), std::move(op), std::move(in), type, check.shape, {}, false}));
+  return Tensor(&nodes_.emplace_back(Node{.id = static_cast<int>(nodes_.size()),
+                                          .op = std::move(op),
+                                          .in = std::move(in),
+                                          .type = check.type,
+                                          .shape = check.shape}));
 }
 
 Tensor Graph::input(const Slot* slot) {

@@ -9,8 +9,11 @@
 namespace vla {
 
 Heads Heads::read(const Scope& s, RotaryAngle angle) {
-  Heads heads = {s.dim("n_head", 1024), s.dim("n_head_kv", 1024), s.dim("d_head")};
-  heads.rope_base = s.number("rope_base", kRopeBase), heads.rope_angle = angle;
+  const Heads heads = {.n_head = s.dim("n_head", 1024),
+                       .n_head_kv = s.dim("n_head_kv", 1024),
+                       .d_head = s.dim("d_head"),
+                       .rope_base = s.number("rope_base", kRopeBase),
+                       .rope_angle = angle};
   s.require(heads.n_head % heads.n_head_kv == 0, "n_head_kv", fmt::format("a divisor of n_head {}", heads.n_head),
             std::to_string(heads.n_head_kv));
   s.require(heads.d_head % 2 == 0, "d_head", "an even number, for the rotary pairs", std::to_string(heads.d_head));

@@ -32,7 +32,12 @@ struct Heads {
   static Heads read(const Scope& s, RotaryAngle angle);
   /// Heads that share the model's width evenly, with biases everywhere.
   static Heads even(int d_model, int n_head, Rule rule = Rule::floats) {
-    return {n_head, n_head, d_model / n_head, Bias::yes, Bias::yes, {}, rule};
+    return {.n_head = n_head,
+            .n_head_kv = n_head,
+            .d_head = d_model / n_head,
+            .bias = Bias::yes,
+            .out_bias = Bias::yes,
+            .rule = rule};
   }
   /// The rotary table of `count` tokens from position `first` on.
   Tensor rotary(Graph& g, int first, int count) const;

@@ -20,9 +20,13 @@ Status check_one_robot(const Engine& engine, const char* option) {
 
 ActLimits act_limits(const ServerOptions& options, const Robot& robot) {
   const Processor& processor = robot.processor();
-  return {options.max_pixels,          options.max_text,        processor.views().names().size(),
-          robot.solver_horizon(),      robot.d_action_padded(), static_cast<int>(processor.action_names().size()),
-          processor.recipe().fit.get()};
+  return {.max_pixels = options.max_pixels,
+          .max_text = options.max_text,
+          .max_views = processor.views().names().size(),
+          .horizon = robot.solver_horizon(),
+          .d_noise = robot.d_action_padded(),
+          .d_action = static_cast<int>(processor.action_names().size()),
+          .fit = processor.recipe().fit.get()};
 }
 
 Status spend(ActLimits& left, int width, int height, std::int64_t work, const std::string& where) {

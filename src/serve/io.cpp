@@ -150,17 +150,17 @@ void Io::send_without_memory(Answer& answer) noexcept {
 void Io::deliver(Answer& answer) {
   const Job& job = answer.job;
   const net::Bytes* const native = job.call->native();
-  Answered answered{job,
-                    answer.error ? &*answer.error : nullptr,
-                    answer.started,
-                    answer.finished,
-                    {},
-                    std::move(answer.stages),
-                    answer.response.size(),
-                    native != nullptr ? native->span() : std::as_bytes(std::span(answer.record.request)),
-                    std::as_bytes(std::span(native != nullptr ? answer.response : answer.record.response)),
-                    answer.out_of_range,
-                    answer.notes};
+  Answered answered{.request = job,
+                    .error = answer.error ? &*answer.error : nullptr,
+                    .started = answer.started,
+                    .finished = answer.finished,
+                    .sent = {},
+                    .stages = std::move(answer.stages),
+                    .n_sent = answer.response.size(),
+                    .in = native != nullptr ? native->span() : std::as_bytes(std::span(answer.record.request)),
+                    .out = std::as_bytes(std::span(native != nullptr ? answer.response : answer.record.response)),
+                    .out_of_range = answer.out_of_range,
+                    .notes = answer.notes};
   job.call->send(answer.response);
   if (answer.error) {
     count_error();

@@ -11,7 +11,7 @@ TEST_CASE("the plans of all robots together stay within one limit, and give way 
   const WeightlessSmolVla smolvla(1, "");
   const Network one = smolvla.network(), other = smolvla.other_robot();
   Plans plans = smolvla.plans();
-  const InputShape first{512, 512, 2, 1, 32};
+  const InputShape first{.width = 512, .height = 512, .n_view = 2, .n_text = 1, .d_state = 32};
   REQUIRE(plans.for_shape(one, first).ok());
   CHECK(plans.find(other, first) == nullptr);
   std::size_t largest = plans.size();

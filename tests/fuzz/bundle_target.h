@@ -65,8 +65,11 @@ inline Depth check_load(const Bundle& bundle) {
   const bool is_solved = accepted(Solver::read(bundle.keys()));
   if (!is_processed || !is_declared || !is_solved) return Depth::parsed;
   const Recipe& recipe = processor->recipe();
-  const InputShape shape = {recipe.width, recipe.height, static_cast<int>(processor->views().names().size()),
-                            recipe.max_tokens, 1};
+  const InputShape shape = {.width = recipe.width,
+                            .height = recipe.height,
+                            .n_view = static_cast<int>(processor->views().names().size()),
+                            .n_text = recipe.max_tokens,
+                            .d_state = 1};
   return accepted(policy->check(shape)) ? Depth::declared : Depth::parsed;
 }
 

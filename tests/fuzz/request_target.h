@@ -20,7 +20,9 @@ struct RequestFate {
 /// Reads bytes as the server does. What is accepted must keep every limit, and what is refused must be refused with a
 /// message of bounded length. Aborts when it is not so.
 inline RequestFate check_request(std::span<const std::byte> bytes) {
-  constexpr serve::ActLimits kLimits{1 << 16, 100, 4, 3, 5, 2};  // small, so that the time goes into the decoders
+  // Small, so that the time goes into the decoders.
+  constexpr serve::ActLimits kLimits{
+      .max_pixels = 1 << 16, .max_text = 100, .max_views = 4, .horizon = 3, .d_noise = 5, .d_action = 2};
   const auto refuse = [](const Error& error) {
     if (error.message().size() > 4096) std::abort();
     if (error.code != Code::bad_request && error.code != Code::incompatible && error.code != Code::too_large &&

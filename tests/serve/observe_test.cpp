@@ -63,7 +63,14 @@ std::string content(const std::string& path) {
 
 /// A request that was answered after 10 ms, of which it waited 4 and was computed for 5.
 struct Sample {
-  Received request{"12", "10.0.0.7", "arm 1.0", 7, Kind::act, 3, Clock::now(), true};
+  Received request{.client = "12",
+                   .peer = "10.0.0.7",
+                   .name = "arm 1.0",
+                   .request_id = 7,
+                   .kind = Kind::act,
+                   .size = 3,
+                   .at = Clock::now(),
+                   .is_first = true};
   Error error{Code::bad_observation, "where", "this", "that", "do"};
   std::string in = "abc", out = "defgh";
   Answered answered(bool with_error, std::size_t n_in = 3) {
@@ -72,15 +79,15 @@ struct Sample {
     const auto at = request.at;
     Timing stages;
     if (!with_error) stages = {{"decode", 1.0}, {"steps", 3.5}};
-    return {request,
-            with_error ? &error : nullptr,
-            at + milliseconds(4),
-            at + milliseconds(9),
-            at + milliseconds(10),
-            stages,
-            out.size(),
-            std::as_bytes(std::span(in)),
-            std::as_bytes(std::span(out))};
+    return {.request = request,
+            .error = with_error ? &error : nullptr,
+            .started = at + milliseconds(4),
+            .finished = at + milliseconds(9),
+            .sent = at + milliseconds(10),
+            .stages = stages,
+            .n_sent = out.size(),
+            .in = std::as_bytes(std::span(in)),
+            .out = std::as_bytes(std::span(out))};
   }
 };
 
@@ -290,9 +297,7 @@ TEST_CASE("notes of chunks are warnings at the default level, once a minute for 
       for (const char* client : {"1", "2"}) {
         Received request;
         request.client = client;
-        Answered answered{request, nullptr, {}, {}, {}, {}, 0, {}, {}, true};
-        answered.notes = notes;
-        log.answered(answered);
+        log.answered(Answered{.request = request, .out_of_range = true, .notes = notes});
       }
     }
   }
@@ -309,7 +314,7 @@ TEST_CASE("a trace ends at its limit, is valid JSON then too, and is not written
     auto trace = Trace::open(folder / "out.json", 2000);
     REQUIRE(trace);
     Received request;
-    for (int i = 0; i < 100; ++i) (*trace)->answered(Answered{request, nullptr, {}, {}, {}, {}, 0, {}, {}, false});
+    for (int i = 0; i < 100; ++i) (*trace)->answered(Answered{.request = request});
     CHECK((*trace)->n_dropped() > 80);
   }
   CHECK(nlohmann::json::accept(content(folder / "out.json")));

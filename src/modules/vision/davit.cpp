@@ -177,7 +177,14 @@ Davit::Davit(const Scope& s)
         Stage{ConvEmbed(here / "embed", d_model_, d_model[i], size[i], stride[i], pre_norm[i] == 1, eps), {}, {}});
     const auto places = [&](int n) { return (n + size[i] / 2 * 2 - size[i]) / stride[i] + 1; };
     d_model_ = d_model[i], n_head_ = n_head[i], n_column_ = places(n_column_), n_row_ = places(n_row_);
-    const DavitStage sizes = {d_model_, n_head_, n_group[i], d_ff[i], n_column_, n_row_, window, eps};
+    const DavitStage sizes = {.d_model = d_model_,
+                              .n_head = n_head_,
+                              .n_group = n_group[i],
+                              .d_ff = d_ff[i],
+                              .n_column = n_column_,
+                              .n_row = n_row_,
+                              .window = window,
+                              .norm_eps = eps};
     for (int b = 0; b < n_layer[i]; ++b) {
       stage.spatial.emplace_back(here / "blk" / b / "spatial", sizes);
       stage.channel.emplace_back(here / "blk" / b / "channel", sizes);
