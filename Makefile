@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test arm64 test-arm64 test-cuda test-vulkan build vulkan cuda gpu-kit wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
+.PHONY: help demo libero test check check-includes arm64 test-arm64 test-cuda test-vulkan build vulkan cuda gpu-kit wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -14,6 +14,8 @@ help:
 	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
 	@echo "make libero    the benchmark LIBERO in $(LIBERO) for vla-eval (0.7 GB to download), one of its tasks drawn as proof, and \`vla\`"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
+	@echo "make check T=processor/letterbox   build and run the tests whose file, or else whose name, has this in it"
+	@echo "make check-includes   compile every source on its own, without groups and precompiled headers"
 	@echo "make test-cuda   all tests of our kernels for CUDA, without a GPU (downloads 102 MB: NVIDIA's compiler)"
 	@echo "make test-vulkan all golden cases on --device vulkan, of which make test tries one of each family"
 	@echo "make test-arm64  build for 64-bit ARM with both packages, and test that under an emulator; no part of make test, whose time its build alone would exceed"
@@ -139,6 +141,16 @@ test: build vulkan asan
 	@scripts/packages.sh test || echo "make: tests on an emulated processor skip"
 	@scripts/cuda.sh .cache/nvcc nvcc || echo "make: tests of what nvcc makes of our kernels skip"
 	$(VENV)/bin/python scripts/test.py
+
+check: packages $(STAMP)
+	@test -f build/cpu/build.ninja || cmake --preset cpu $(CMAKE_ARGS)
+	@$(PYTHON) scripts/check.py "$(T)"
+
+# A source of a group may use what another one includes.
+check-includes: packages
+	@test -f build/includes/build.ninja || cmake -S . -B build/includes -G Ninja -DCMAKE_BUILD_TYPE=Release -DVLA_UNITY=OFF -DVLA_WERROR=ON \
+	  -DCMAKE_CXX_FLAGS_RELEASE="-O1 -DNDEBUG" $(CMAKE_ARGS)
+	cmake --build build/includes --target all test_base test_bundle test_modules test_bench
 
 # All golden cases, of which `make test` tries one of each family, on the first device that Vulkan has.
 test-vulkan: vulkan

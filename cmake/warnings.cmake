@@ -10,6 +10,9 @@ function(vla_warnings target)
   if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
     # GCC 12 reports std::string's own operator+ at -O3, and moved variants in instrumented code.
     target_compile_options(${target} PRIVATE -Wno-restrict)
+    if(VLA_UNITY)  # GCC warns of unnamed types of every file but the main one, which a group has not
+      target_compile_options(${target} PRIVATE -Wno-subobject-linkage)
+    endif()
     if(VLA_SANITIZE)
       target_compile_options(${target} PRIVATE -Wno-maybe-uninitialized)
     endif()

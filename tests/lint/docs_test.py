@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the documents name exists: every path, `--flag`, make target and function in README.md, python/README.md and docs/*.md.
+"""What the documents name exists: every path, `--flag`, make target and function in README.md, CONTRIBUTING.md, python/README.md and docs/*.md.
 
     python3 tests/lint/docs_test.py
 
@@ -100,7 +100,7 @@ def problems(root):
     found = []
     makefile = (root / "Makefile").read_text() if (root / "Makefile").is_file() else ""
     targets = set(re.findall(r"^([\w-]+):(?!=)", makefile, re.M))
-    for document in [root / "README.md", *root.glob("python/README.md"), *sorted((root / "docs").glob("*.md"))]:
+    for document in [root / "README.md", *root.glob("CONTRIBUTING.md"), *root.glob("python/README.md"), *sorted((root / "docs").glob("*.md"))]:
         text, name = document.read_text(encoding="utf-8"), document.relative_to(root).as_posix()
         for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
             if "://" not in link and not (document.parent / link).exists():

@@ -14,7 +14,7 @@ namespace {
 namespace asio = boost::asio;
 using asio::local::stream_protocol;
 using boost::system::error_code;
-using Kind = LinkMessage::Kind;
+using LinkKind = LinkMessage::Kind;
 
 struct Head {
   std::uint32_t kind = 0, n_text = 0;
@@ -33,7 +33,7 @@ class Link::Ends : public std::enable_shared_from_this<Link::Ends> {
     handler_ = &handler;
     read_head();
   }
-  void send(Kind kind, std::uint64_t connection, const std::string& text, std::string_view bytes) {
+  void send(LinkKind kind, std::uint64_t connection, const std::string& text, std::string_view bytes) {
     if (handler_ == nullptr && is_broken_) return;
     const Head head{static_cast<std::uint32_t>(kind), static_cast<std::uint32_t>(text.size()), connection,
                     bytes.size()};
@@ -63,11 +63,13 @@ class Link::Ends : public std::enable_shared_from_this<Link::Ends> {
                      });
   }
   void read_rest() {
-    if (head_.kind > static_cast<std::uint32_t>(Kind::keep) || head_.n_text > kMaxText || head_.n_bytes > max_bytes_)
+    if (head_.kind > static_cast<std::uint32_t>(LinkKind::keep) || head_.n_text > kMaxText ||
+        head_.n_bytes > max_bytes_)
       return fail("what came is no message");
     auto bytes = net::Bytes::make(head_.n_bytes);
     if (!bytes) return fail("no memory for a message");
-    message_ = {static_cast<Kind>(head_.kind), head_.connection, std::string(head_.n_text, '\0'), std::move(*bytes)};
+    message_ = {static_cast<LinkKind>(head_.kind), head_.connection, std::string(head_.n_text, '\0'),
+                std::move(*bytes)};
     const std::span<std::byte> span = message_.bytes.span();
     const std::array parts{asio::buffer(message_.text), asio::buffer(span.data(), span.size())};
     asio::async_read(socket_, parts, [self = shared_from_this()](error_code error, std::size_t) {
