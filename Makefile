@@ -172,7 +172,7 @@ arm64: packages $(STAMP)
 # For the release of Debian that the libraries are of; without a list of components (scripts/sbom.py looks at installed packages).
 deb-arm64: arm64
 	cpack --config build/arm64/CPackConfig.cmake -B out \
-	  -D CPACK_DEBIAN_PACKAGE_DEPENDS="$$(scripts/arm64_depends.sh $(SYSROOT) build/arm64/bin/vla build/arm64/lib/libvla.so.1)"
+	  -D CPACK_DEBIAN_PACKAGE_DEPENDS="$$(scripts/arm64_depends.sh $(SYSROOT) build/arm64/bin/vla build/arm64/bin/vla-door-lerobot build/arm64/lib/libvla.so.1)"
 	@rm -rf out/_CPack_Packages
 
 wheel-arm64: arm64

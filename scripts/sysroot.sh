@@ -9,7 +9,8 @@ set -euo pipefail
 folder=$(mkdir -p "$1" && cd "$1" && pwd)
 state=$folder/.apt
 packages=(libfmt-dev libpng-dev libjpeg62-turbo-dev libxxhash-dev libutf8proc-dev nlohmann-json3-dev libcli11-dev doctest-dev
-          libzmq3-dev cppzmq-dev libsodium-dev libprotobuf-dev prometheus-cpp-dev libmsgpack-cxx-dev libboost-dev libc6-dev libstdc++-12-dev)
+          libzmq3-dev cppzmq-dev libsodium-dev libprotobuf-dev prometheus-cpp-dev libmsgpack-cxx-dev libboost-dev libnghttp2-dev
+          libc6-dev libstdc++-12-dev)
 content="${packages[*]}, and .shlibs"
 [ "$(cat "$folder/.complete" 2>/dev/null)" = "$content" ] && exit 0
 rm -rf "$state" && mkdir -p "$state"/{lists/partial,cache/archives/partial,state}
