@@ -109,7 +109,7 @@ void DoorFront::begin(Io& io) {
 void DoorFront::beat() {
   timer_.expires_after(kBeat);
   timer_.async_wait([this](boost::system::error_code cancelled) {
-    if (cancelled) return;
+    if (cancelled || !link_) return;  // a turn that was due when the link broke comes nevertheless
     if (++n_silent_ > kMaxSilent || (n_silent_ > kMaxStopped && process_.is_stopped()))
       return fail("it does not answer");
     link_->send(Say::ping);
