@@ -116,7 +116,7 @@ class Connection;
 struct Shared : net::Connections<Connection> {
   const CurveKeys* keys;
   Hub::Handler* handler = nullptr;
-  bool has_freed = false;  // since the last sweep: answers of connections that closed
+  bool has_freed = false;  // since the last sweep: what connections that closed had sent, or had not read
 };
 
 class Connection : public std::enable_shared_from_this<Connection> {
@@ -149,9 +149,9 @@ class Connection : public std::enable_shared_from_this<Connection> {
     error_code ignored;
     socket_.shutdown(Socket::shutdown_both, ignored);
     socket_.close(ignored);
+    shared_.has_freed = shared_.has_freed || n_unread_ > 0 || n_held_ > 0;
     hold(0);
     if (out_.size() > 1) out_.erase(out_.begin() + 1, out_.end());  // the first one belongs to the write until it ends
-    shared_.has_freed = shared_.has_freed || n_unread_ > 0;
     shared_.connections.erase(client_.connection);
   }
 
