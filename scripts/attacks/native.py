@@ -1,16 +1,18 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Attacks on the native protocol and on the HTTP of the metrics."""
+"""Attacks on the native protocol."""
 
+import contextlib
 import itertools
-import socket
+import threading
 import time
-from urllib.parse import urlsplit
 
 import hostile
 import hostile_images
 import numpy as np
 import zmq
+
+from vla_cpp import wire
 
 from .peers import ATTACKER, act_of, again_and_again, connect, png, request, silent, spec_of
 
@@ -66,20 +68,6 @@ def drip(target):
     again_and_again(*[one] * 20)
 
 
-def drip_http(target):
-    """60 HTTP requests that come a byte at a time, and take the page a byte at a time."""
-    host = urlsplit(target.metrics)
-
-    def one():
-        raw = socket.create_connection((host.hostname, host.port), timeout=20, source_address=(ATTACKER, 0))
-        with raw:
-            for byte in b"GET /metrics HTTP/1.1\r\nHost: robot\r\nX-Long: " + b"x" * 1000:
-                raw.sendall(bytes([byte]))
-                time.sleep(0.01)
-
-    again_and_again(*[one] * 60)
-
-
 def hostile_png(target):
     """Acts with an image of 200 compressed texts that would be 8 MB each, and one of fewer rows than it announces."""
     spec = spec_of(target)
@@ -109,6 +97,35 @@ def many_addresses(target):
                 pass
 
     again_and_again(*[lambda n=n: one(f"127.0.{1 + n // 128}.{1 + n % 128}") for n in range(256)])
+
+
+def small_refusals(target):
+    """Acts of six bytes, as many as go: each is refused."""
+    act = bytes([0, 6]) + b"\x08\x01\x10\x01\x2a\x00"
+    again_and_again(*[lambda: pour(target, itertools.repeat(act * 1000))] * 2)
+
+
+def large_refusals(target):
+    """Acts of 30 MB that are all instruction."""
+    message = wire.Request(protocol_version=1, request_id=7)
+    message.act.text = "x" * 30_000_000
+    data = message.SerializeToString()
+    again_and_again(lambda: pour(target, itertools.repeat(hostile.long_frame(len(data), data, flags=2)), pause=0.5))
+
+
+def pour(target, pieces, pause=0.0):
+    """A connection that sends without end, and reads what comes."""
+    with connect(target, hostile.HANDSHAKE) as raw:
+        threading.Thread(target=drain, args=(raw,), daemon=True).start()
+        for piece in pieces:
+            raw.sendall(piece)
+            time.sleep(pause)
+
+
+def drain(raw):
+    with contextlib.suppress(OSError):
+        while raw.recv(1 << 16):
+            pass
 
 
 def ask_for_ever(target, acts, n_connection=70, source=ATTACKER):

@@ -56,10 +56,10 @@ def spec_of(target):
             return client.spec
 
 
-def scene(spec, seed):
-    """Frames by view and vectors by state."""
+def scene(spec, seed, scale=1):
+    """Frames by view and vectors by state. scale: sides of the frames over those of the views."""
     rng = np.random.default_rng(seed)
-    images = {v.name: rng.integers(0, 255, (v.height, v.width, 3), np.uint8) for v in spec.views}
+    images = {v.name: rng.integers(0, 255, (scale * v.height, scale * v.width, 3), np.uint8) for v in spec.views}
     return images, {s.name: np.full(s.width, 0.1, np.float32) for s in spec.states}
 
 

@@ -101,17 +101,18 @@ def pieces(data):
 
 
 class Robot:
-    """The calls of LeRobot's robot_client."""
+    """The calls of LeRobot's robot_client. patience: seconds of each."""
 
-    def __init__(self, address):
+    def __init__(self, address, patience=SECONDS):
         import grpc
 
         # A connection of its own: gRPC shares one between channels of a process, and a server tells robots by it.
-        self.channel = grpc.insecure_channel(address.removeprefix("grpc://"), [("grpc.use_local_subchannel_pool", 1)])
+        options = [("grpc.use_local_subchannel_pool", 1), ("grpc.initial_reconnect_backoff_ms", 100), ("grpc.min_reconnect_backoff_ms", 100)]
+        self.channel = grpc.insecure_channel(address.removeprefix("grpc://"), options)
 
         def call(kind, name):
             method = getattr(self.channel, kind)(f"/transport.AsyncInference/{name}", None, None)
-            return lambda message: method(message, timeout=SECONDS, wait_for_ready=True)
+            return lambda message: method(message, timeout=patience, wait_for_ready=True)
 
         self._ready, self._setup = call("unary_unary", "Ready"), call("unary_unary", "SendPolicyInstructions")
         self._observe, self._actions = call("stream_unary", "SendObservations"), call("unary_unary", "GetActions")
