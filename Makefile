@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test check check-includes arm64 test-arm64 test-cuda test-vulkan build vulkan cuda gpu-kit wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
+.PHONY: help demo libero test soak check check-includes arm64 test-arm64 test-cuda test-vulkan build vulkan cuda gpu-kit wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -29,6 +29,7 @@ help:
 	@echo "make image     that package in the image of packaging/Containerfile, without a registry, and one act served from it (Debian 12; needs root)"
 	@echo "make deb-arm64, make wheel-arm64   the same two for 64-bit ARM, built here"
 	@echo "make tsan      run the tests of executor, engine and server under the thread sanitizer"
+	@echo "make soak      two servers and eight robots for SECONDS=120, while policies, recordings and processes come and go"
 	@echo "make fuzz      install clang, build the fuzz targets and run each for SECONDS=600"
 	@echo "make format    format the C++ sources"
 	@echo "make clean     remove what was built"
@@ -151,6 +152,11 @@ check-includes: packages
 	@test -f build/includes/build.ninja || cmake -S . -B build/includes -G Ninja -DCMAKE_BUILD_TYPE=Release -DVLA_UNITY=OFF -DVLA_WERROR=ON \
 	  -DCMAKE_CXX_FLAGS_RELEASE="-O1 -DNDEBUG" $(CMAKE_ARGS)
 	cmake --build build/includes --target all test_base test_bundle test_modules test_bench
+
+# An hour: make soak SECONDS=3600.
+soak: SECONDS = 120
+soak: build
+	$(VENV)/bin/python scripts/soak.py --seconds $(SECONDS)
 
 # All golden cases, of which `make test` tries one of each family, on the first device that Vulkan has.
 test-vulkan: vulkan
