@@ -7,6 +7,7 @@ import contextlib
 import os
 import re
 import shlex
+import socket
 import subprocess
 import sys
 import threading
@@ -116,11 +117,11 @@ def test_a_message_of_many_values_is_refused_at_once(engine):
 class Door:
     """A front that listens, on a thread of its own. `act` is asynchronous."""
 
-    def __init__(self, act, greet=None, limit=8):
+    def __init__(self, act, greet=None, limit=8, **more):
         async def hello(robot):
             return openpi.pack({"server": "vla.cpp test", "robot": robot})
 
-        self.front = Front(greet or hello, act, limit)
+        self.front = Front(greet or hello, act, limit, **more)
         self.loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self._thread.start()
@@ -248,6 +249,33 @@ def test_browsers_and_one_robot_too_many_are_refused():
             robot.recv(SECONDS)
             with pytest.raises(InvalidStatus, match="503"):
                 front.connect().__enter__()
+
+
+def test_connections_that_never_ask_are_bounded_in_number_and_time_and_a_robot_beside_them_is_answered(monkeypatch):
+    monkeypatch.setattr("front.HANDSHAKE", 1.0)
+    with door(echo, most_handshakes=8) as front:
+        host, _, port = front.place.partition(":")
+        silent = [socket.create_connection((host, int(port)), SECONDS) for _ in range(40)]
+        with front.connect("arm") as robot:
+            robot.recv(SECONDS)
+            robot.send(b"act")
+            assert robot.recv(SECONDS) == b"act of arm"
+            for connection in silent[:32]:
+                connection.settimeout(SECONDS)
+                assert ended(connection)  # for those that came after it
+            begun = time.monotonic()
+            assert all(ended(connection) for connection in silent)
+            assert time.monotonic() - begun < 5, "the time of a handshake"
+            robot.send(b"again")
+            assert robot.recv(SECONDS) == b"again of arm"
+        assert front.page("/healthz") == (200, b"OK\n")
+
+
+def ended(connection):
+    try:
+        return connection.recv(1) == b""
+    except ConnectionResetError:
+        return True
 
 
 # --- load.py
