@@ -24,6 +24,7 @@
 #include "serve/names.h"
 #include "serve/native/codec.h"
 #include "serve/server.h"
+#include "serve/warm_up.h"
 
 namespace vla::cli {
 namespace {

@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cmath>
 #include <new>
+#include <utility>
 
 #include "base/process.h"
 
@@ -153,6 +154,21 @@ void Engine::record(std::vector<Tap>& taps, const char* path, std::vector<std::i
   if (match_path(tap_pattern_, path)) taps.push_back({path, std::move(shape), {values.begin(), values.end()}});
 }
 
+Result<std::string> Engine::find_not_finite(const Observation& observation, const Noise& noise) {
+  std::string found;
+  const TapVisitor find = [&found](const std::string& path, auto, std::span<const float> values) {
+    if (found.empty() && !std::ranges::all_of(values, [](float value) { return std::isfinite(value); })) found = path;
+  };
+  const std::string pattern = std::exchange(tap_pattern_, "*");
+  const TapVisitor see = std::exchange(see_tap_, find);
+  plans_.emplace(PlanContext{*device_, tap_pattern_, dry_, injected_.empty() ? nullptr : &injected_, {}, see_tap_});
+  const Result<ActionChunk> chunk = act(observation, noise);
+  tap_pattern_ = pattern, see_tap_ = see;
+  last_.reset();
+  VLA_CHECK(make_plans(dry_));
+  return chunk || chunk.error().code == Code::bad_action ? Result(found) : chunk.error();
+}
+
 Result<std::string> Engine::program_text(Part part) {
   VLA_TRY(const Plan* plan, plans_->for_shape(robot().network(), robot().largest_shape()));
   return (part == Part::prefix ? plan->prefix() : plan->step()).text();
@@ -222,6 +238,13 @@ Status Engine::solve(Plan& plan, int n_step, std::vector<Tap>& taps) {
   return {};
 }
 
+/// Shows what was recorded to whoever wants to see it rather than to have it.
+void Engine::show(std::vector<Tap>& taps) const {
+  if (!see_tap_) return;
+  for (const Tap& tap : taps) see_tap_(tap.path, tap.shape, tap.values);
+  taps.clear();
+}
+
 Result<ActionChunk> Engine::run(EncodedObservation& encoded) {
   const Robot& robot = *encoded.robot;
   const Inputs& in = encoded.inputs;
@@ -242,12 +265,12 @@ Result<ActionChunk> Engine::run(EncodedObservation& encoded) {
   for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(timing, stage.name, stage.done);
   clock.lap(timing, "prefix", plan->prefix_ended());
   clock.lap(timing, "steps");
+  show(taps);
   VLA_TRY(ActionChunk chunk, robot.decode(x, in));
   clock.lap(timing, "postprocess");
   record(taps, "chunk", {chunk.d_action, chunk.horizon}, chunk.normalized);
   record(taps, "actions", {chunk.d_action, chunk.horizon}, chunk.actions);  // the same in world units
-  if (see_tap_)
-    for (const Tap& tap : std::exchange(taps, {})) see_tap_(tap.path, tap.shape, tap.values);
+  show(taps);
   chunk.timing = std::move(timing), chunk.taps = std::move(taps);
   return chunk;
 }

@@ -84,7 +84,10 @@ class Engine {
   /// Computes an act of zeros, so that the first one of this size finds its plan, and on a GPU its graph. Errors:
   /// bad_observation (no observation of this bundle has that size), device, out_of_memory, internal.
   Status warm_up(const ActShape& act) noexcept;
-
+  /// Computes an act again with all taps: the path of the first value of the network that is not finite, or nothing
+  /// where all are. Slow, since its plans are built for it; no other thread may prepare meanwhile. Errors: those of
+  /// `act` but bad_action.
+  Result<std::string> find_not_finite(const Observation& observation, const Noise& noise);
   /// Solves for the first robot in another number of steps than the bundle asks for, to measure what a step costs; no
   /// other thread may prepare meanwhile. Errors: bad_bundle, out_of_memory, device.
   Status set_steps(int n_step);
@@ -135,6 +138,7 @@ class Engine {
   Status inject_inputs(Inputs& inputs) const;
   Result<ActionChunk> run(EncodedObservation& encoded);
   Status solve(Plan& plan, int n_step, std::vector<Tap>& taps);
+  void show(std::vector<Tap>& taps) const;
   template <class T>
   void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
               const std::vector<T>& values) const;

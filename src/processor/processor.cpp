@@ -264,6 +264,10 @@ Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int h
     if (const std::size_t bad = first_bad(std::span(actions).last(width)); bad < width)
       return Error{Code::bad_action, fmt::format("actions[{}][\"{}\"]", i, action_names_[bad]), "a finite number",
                    fmt::format("{}", row[bad])};
+    // Ops that choose, such as a gripper's threshold, make a number of anything. Padded columns do not matter.
+    if (const std::size_t n = std::min(width, numbers.size()), bad = first_bad(numbers.first(n)); bad < n)
+      return Error{Code::bad_action, fmt::format("actions[{}]", i), "finite numbers of the network",
+                   fmt::format("{} in column {}", numbers[bad], bad)};
   }
   return actions;
 }

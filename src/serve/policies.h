@@ -32,6 +32,9 @@ class Policies {
  public:
   explicit Policies(std::string default_name) : default_name_(std::move(default_name)) {}
 
+  /// From now on this one is the default: who names none keeps what it was told, whatever else is loaded.
+  void keep_default(const std::string& name) { default_name_ = name; }
+
   /// Without a name the default, or the only one. Errors: bad_observation, with the names that there are.
   Result<std::shared_ptr<ServedPolicy>> find(const std::string& name) const;
   /// One of a name that is there takes the other's place, which is returned. Clients keep what they were told: errors:
@@ -46,7 +49,7 @@ class Policies {
  private:
   Error unknown(const std::string& name) const;
 
-  const std::string default_name_;
+  std::string default_name_;
   std::map<std::string, std::shared_ptr<ServedPolicy>> policies_;
 };
 

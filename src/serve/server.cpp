@@ -16,7 +16,6 @@
 #include "base/out_of_memory.h"
 #include "base/thread.h"
 #include "net/descriptors.h"
-#include "processor/ops/op.h"
 #include "serve/door/front.h"
 #include "serve/double_buffer.h"
 #include "serve/gr00t/front.h"
@@ -93,52 +92,7 @@ v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
   return limits;
 }
 
-/// As many words as the prompt takes: where its own tokens must stay whole, fewer than it has tokens.
-std::string longest_text(const Processor& processor, Observation observation) {
-  Inputs inputs;
-  for (int n_word = processor.recipe().max_tokens; n_word > 0; n_word = n_word * 3 / 4) {
-    observation.text.clear();
-    for (int i = 0; i < n_word; ++i) observation.text += "go ";
-    if (processor.encode_state(observation, inputs) && processor.encode_text(observation, inputs))
-      return observation.text;
-  }
-  return {};
-}
-
-/// An observation of a robot with every view and the longest text.
-Observation largest_observation(const Robot& robot) {
-  const Processor& processor = robot.processor();
-  const Recipe& recipe = processor.recipe();
-  const auto [width, height] = recipe.fit->camera_size().value_or(CameraSize{recipe.width, recipe.height});
-  const std::vector<std::uint8_t> grey(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3, 128);
-  Observation observation;
-  for (const std::string& view : processor.views().names()) observation.views.emplace(view, Frame{width, height, grey});
-  for (std::size_t i = 0; i < processor.states().names().size(); ++i)
-    observation.states.emplace(processor.states().names()[i],
-                               std::vector<float>(static_cast<std::size_t>(processor.state_dims()[i])));
-  observation.text = longest_text(processor, observation);
-  observation.embodiment = robot.bundle().embodiment();
-  return observation;
-}
-
 }  // namespace
-
-Result<double> warm_up(Engine& engine, const std::vector<ActShape>& sizes) {
-  const auto start = Clock::now();
-  const auto is_refused = [](const Error& error) {
-    return error.code == Code::bad_observation || error.code == Code::bad_action;
-  };
-  for (const Robot* robot : engine.robots()) {
-    EncodedObservation encoded;  // its memory is not kept: every act that is served brings its own
-    Status valid = engine.encode(largest_observation(*robot), Noise(std::uint64_t{0}), {}, encoded);
-    if (valid) valid = engine.send_ahead(encoded);
-    const auto chunk = valid ? engine.compute(encoded) : Result<ActionChunk>(valid.error());
-    if (!chunk && !is_refused(chunk.error())) return chunk.error();
-  }
-  for (const ActShape& size : sizes)
-    if (const Status done = engine.warm_up(size); !done && !is_refused(done.error())) return done.error();
-  return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
-}
 
 Exchange::Jobs::Limits Server::limits_of(const ServerOptions& options) {
   return {options.max_queue, kQueueMessages * options.max_message};
@@ -202,6 +156,7 @@ Status Server::begin() {
                  "clients of other protocols name no policy"};
   if (policy) {
     for (const auto& front : fronts_) VLA_CHECK(front->serve(**policy));
+    policies_.keep_default((*policy)->name);
   }
   return {};
 }

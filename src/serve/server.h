@@ -14,12 +14,6 @@
 
 namespace vla::serve {
 
-/// Computes one act of a synthetic observation with every view and the longest text, so that the first client does not
-/// pay for what happens once. A policy may refuse such an observation; what fails otherwise would fail every act.
-/// One of each of `sizes` too, but for those that observations of this policy cannot have. Milliseconds. Errors:
-/// device, out_of_memory, internal.
-Result<double> warm_up(Engine& engine, const std::vector<ActShape>& sizes = {});
-
 /// Resident policies behind the sockets of the front ends. It keeps nothing between requests.
 class Server {
  public:
@@ -42,8 +36,9 @@ class Server {
   Status unload(const std::string& name);
   /// While it runs, from another thread. Errors: shutting_down.
   Result<std::vector<std::shared_ptr<ServedPolicy>>> policies();
-  /// Tells the front ends which policy clients get that name none; once policies were added. Errors: usage where there
-  /// is none of that, or where a front end cannot carry what it takes.
+  /// Tells the front ends which policy clients get that name none, and keeps it for them: the default, or the only one;
+  /// once policies were added. Errors: usage where there is none of that, or where a front end cannot carry what it
+  /// takes.
   Status begin();
   /// The front ends' notes on their names, for people; after `begin`.
   std::vector<std::string> told() const;

@@ -8,6 +8,7 @@
 #include <fstream>
 
 #include "serve/support.h"
+#include "serve/warm_up.h"
 
 using namespace vla;
 using namespace vla::test;

@@ -9,6 +9,7 @@
 #include <random>
 
 #include "serve/support.h"
+#include "serve/warm_up.h"
 
 using namespace vla;
 using namespace vla::test;

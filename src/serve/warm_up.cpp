@@ -1,0 +1,116 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/warm_up.h"
+
+#include <fmt/format.h>
+
+#include <optional>
+
+#include "base/clock.h"
+#include "processor/ops/op.h"
+
+namespace vla::serve {
+namespace {
+
+/// Observations that are tried: a state of our making may be none of the robot's, as zeros are no rotation.
+constexpr std::uint64_t kTries = 3;
+
+/// As many words as the prompt takes: where its own tokens must stay whole, fewer than it has tokens.
+std::string longest_text(const Processor& processor, Observation observation) {
+  Inputs inputs;
+  for (int n_word = processor.recipe().max_tokens; n_word > 0; n_word = n_word * 3 / 4) {
+    observation.text.clear();
+    for (int i = 0; i < n_word; ++i) observation.text += "go ";
+    if (processor.encode_state(observation, inputs) && processor.encode_text(observation, inputs))
+      return observation.text;
+  }
+  return {};
+}
+
+/// The middle of a state's training data, where the bundle says what that is, else zeros.
+std::vector<float> middle_of(const Robot& robot, const std::string& state, std::size_t width) {
+  const auto stats = [&](const char* name) { return robot.bundle().stats(fmt::format("stats.{}.{}", state, name)); };
+  std::vector<float> middle(width);
+  const auto fill = [&](const std::vector<double>& a, const std::vector<double>& b) {
+    if (a.size() != width || b.size() != width) return false;
+    for (std::size_t i = 0; i < width; ++i) middle[i] = static_cast<float>((a[i] + b[i]) / 2);
+    return true;
+  };
+  for (const auto& [low, high] : {std::pair{"mean", "mean"}, std::pair{"min", "max"}, std::pair{"q01", "q99"}})
+    if (const auto a = stats(low), b = stats(high); a && b && fill(*a, *b)) break;
+  return middle;
+}
+
+/// The state that a try has: the middle, then places around it.
+std::vector<float> state_of(const Robot& robot, const std::string& state, std::size_t width, std::uint64_t number) {
+  std::vector<float> values = middle_of(robot, state, width);
+  if (number == 0) return values;
+  const auto away = draw_noise("uniform", number, width);
+  for (std::size_t i = 0; away && i < width; ++i) values[i] += (*away)[i];
+  return values;
+}
+
+/// An observation of a robot with every view and the longest text.
+Observation largest_observation(const Robot& robot, std::uint64_t number) {
+  const Processor& processor = robot.processor();
+  const Recipe& recipe = processor.recipe();
+  const auto [width, height] = recipe.fit->camera_size().value_or(CameraSize{recipe.width, recipe.height});
+  const std::vector<std::uint8_t> grey(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3, 128);
+  Observation observation;
+  for (const std::string& view : processor.views().names()) observation.views.emplace(view, Frame{width, height, grey});
+  for (std::size_t i = 0; i < processor.states().names().size(); ++i)
+    observation.states.emplace(
+        processor.states().names()[i],
+        state_of(robot, processor.states().names()[i], static_cast<std::size_t>(processor.state_dims()[i]), number));
+  observation.text = longest_text(processor, observation);
+  observation.embodiment = robot.bundle().embodiment();
+  return observation;
+}
+
+Status act(Engine& engine, const Observation& observation, std::uint64_t seed) {
+  EncodedObservation encoded;  // its memory is not kept: every act that is served brings its own
+  VLA_CHECK(engine.encode(observation, Noise(seed), {}, encoded));
+  VLA_CHECK(engine.send_ahead(encoded));
+  const auto chunk = engine.compute(encoded);
+  return chunk ? Status() : chunk.error();
+}
+
+/// The refusal of a policy, with the place in it where numbers are not finite first.
+Error not_finite(Engine& engine, const Observation& observation, std::uint64_t seed) {
+  const Result<std::string> tap = engine.find_not_finite(observation, Noise(seed));
+  return {Code::bad_action, "warm-up", "finite actions",
+          tap && !tap->empty() ? fmt::format("numbers that are not, of the network first at the tap {}", *tap)
+                               : std::string("numbers that are not, made of those of the network"),
+          "the weights are damaged, or overflow in this precision: vla run --tap shows the values"};
+}
+
+Status warm_up(Engine& engine, const Robot& robot) {
+  Error refused;
+  std::optional<std::uint64_t> not_finite_at;
+  for (std::uint64_t number = 0; number < kTries; ++number) {
+    const Status answered = act(engine, largest_observation(robot, number), number);
+    if (answered) return {};
+    refused = answered.error();
+    if (refused.code == Code::bad_action) not_finite_at = number;
+    if (refused.code == Code::bad_action || refused.code == Code::bad_observation) continue;
+    not_finite_at.reset();
+    break;
+  }
+  if (not_finite_at) refused = not_finite(engine, largest_observation(robot, *not_finite_at), *not_finite_at);
+  const std::string& tag = robot.bundle().embodiment();
+  refused.where = fmt::format("{}{}: {}", robot.bundle().path(), tag.empty() ? "" : " of " + tag, refused.where);
+  return refused;
+}
+
+}  // namespace
+
+Result<double> warm_up(Engine& engine, const std::vector<ActShape>& sizes) {
+  const auto start = Clock::now();
+  for (const Robot* robot : engine.robots()) VLA_CHECK(warm_up(engine, *robot));
+  for (const ActShape& size : sizes)
+    if (const Status done = engine.warm_up(size); !done && done.error().code != Code::bad_observation)
+      return done.error();
+  return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
+}
+
+}  // namespace vla::serve
