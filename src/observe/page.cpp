@@ -6,15 +6,24 @@
 
 #include <charconv>
 #include <nlohmann/json.hpp>
+#include <optional>
+
+#include "wire/envelope.h"
+#include "wire/fields.h"
 
 namespace vla::serve {
 namespace {
 
 using Json = nlohmann::ordered_json;
 
-constexpr std::size_t kMaxBytes = 96 << 20;  // of the acts that are kept, as they went over the wire
-constexpr std::size_t kMaxAnswer = 40;       // acts in an answer
-constexpr std::size_t kMaxSeen = 8;          // pictures that are kept for a second viewer
+constexpr std::size_t kMaxAnswer = 40;  // acts in an answer
+constexpr std::size_t kMaxSeen = 8;     // pictures that are kept for a second viewer
+
+// What is told of an act: more than any policy has, and little enough that nobody waits for a hostile one.
+constexpr std::size_t kMaxText = 4096, kMaxName = 256;  // bytes
+constexpr std::size_t kMaxViews = 32, kMaxStates = 32, kMaxNotes = 32, kMaxStages = 64;
+constexpr std::size_t kMaxValues = 1024, kMaxActions = 8192;           // numbers
+constexpr std::size_t kMaxMessage = 64 << 10, kMaxResponse = 1 << 20;  // bytes of one that is parsed
 
 constexpr const char* kForbidden = "open the address that vla serve has printed: it ends with a token\n";
 constexpr const char* kNoFolder = "vla serve was started without a folder for recordings: --record DIR\n";
@@ -47,17 +56,51 @@ std::uint64_t number_of(std::string_view query, std::string_view name) {
   return number;
 }
 
-const char* kind_of(const v1::View& view) {
-  switch (view.image_case()) {
-    case v1::View::kJpeg:
-      return "jpeg";
-    case v1::View::kPng:
-      return "png";
-    case v1::View::kRgb:
-      return "rgb";
-    default:
-      return "absent";
+/// The view of an act, in place.
+struct View {
+  std::span<const std::byte> message;
+  std::string_view name;
+  int image = 0;  // number of the field that holds it: rgb, jpeg, png or absent
+  std::span<const std::byte> bytes;
+
+  const char* kind() const {
+    switch (image) {
+      case v1::View::kRgbFieldNumber:
+        return "rgb";
+      case v1::View::kJpegFieldNumber:
+        return "jpeg";
+      case v1::View::kPngFieldNumber:
+        return "png";
+      default:
+        return "absent";
+    }
   }
+};
+
+/// Walks over a message up to its end, or to what is no field: what was refused is shown as far as it goes.
+template <class Use>
+void each_field(std::span<const std::byte> message, const Use& use) {
+  for (wire::Fields field(message, "act");;) {
+    const Result<bool> more = field.next();
+    if (!more || !*more) return;
+    use(field);
+  }
+}
+
+std::string_view view_of(std::span<const std::byte> bytes) {
+  return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
+}
+
+View read_view(std::span<const std::byte> message) {
+  View view{.message = message};
+  each_field(message, [&view](const wire::Fields& field) {
+    if (field.type != 'b') return;
+    if (field.number == v1::View::kNameFieldNumber)
+      view.name = view_of(field.value);
+    else
+      view.image = field.number, view.bytes = field.value;
+  });
+  return view;
 }
 
 Error no_recipe() { return {Code::unsupported, "recipe", "the bundle", "none", "give vla replay its --bundle"}; }
@@ -95,26 +138,81 @@ Json robot_json(const v1::Description& robot, const std::map<std::string, Page::
   return json;
 }
 
+/// The beginning of a text; its end, where that is missing, says so.
+std::string beginning(std::string_view text, std::size_t size) {
+  return text.size() <= size ? std::string(text) : std::string(text.substr(0, size)) + "...";
+}
+
+/// The first elements of a repeated field, made by `make`.
+template <class Field, class Make>
+Json first_of(const Field& field, std::size_t count, const Make& make) {
+  Json json = Json::array();
+  for (const auto& element : field) {
+    if (json.size() == count) break;
+    json.push_back(make(element));
+  }
+  return json;
+}
+
+Json number(float x) { return x; }
+Json note_json(const std::string& note) { return beginning(note, kMaxText); }
+
 Json chunk_json(const v1::ActionChunk& chunk) {
-  Json stages = Json::array();
-  for (const v1::Stage& stage : chunk.stages()) stages.push_back({stage.name(), stage.ms()});
+  const auto stage_json = [](const v1::Stage& stage) { return Json{beginning(stage.name(), kMaxName), stage.ms()}; };
   return {{"horizon", chunk.horizon()},
           {"d_action", chunk.d_action()},
           {"rate_hz", chunk.rate_hz()},
-          {"actions", Json(std::vector<float>(chunk.actions().begin(), chunk.actions().end()))},
-          {"notes", std::vector<std::string>(chunk.notes().begin(), chunk.notes().end())},
+          {"actions", first_of(chunk.actions(), kMaxActions, number)},
+          {"notes", first_of(chunk.notes(), kMaxNotes, note_json)},
           {"queue_ms", chunk.queue_ms()},
-          {"stages", std::move(stages)}};
+          {"stages", first_of(chunk.stages(), kMaxStages, stage_json)}};
 }
 
-Json act_json(const v1::Act& act) {
-  Json json = {
-      {"text", act.text()}, {"embodiment", act.embodiment()}, {"states", Json::object()}, {"views", Json::array()}};
-  if (act.has_deadline_ms()) json["deadline_ms"] = act.deadline_ms();
-  for (const v1::State& state : act.states())
-    json["states"][state.name()] = std::vector<float>(state.values().begin(), state.values().end());
-  for (const v1::View& view : act.views()) json["views"].push_back({{"name", view.name()}, {"kind", kind_of(view)}});
+/// Adds a state's values to `states`; `left` is what the act may still have of them.
+void add_state(std::span<const std::byte> message, Json& states, std::size_t& left) {
+  v1::State state;
+  if (states.size() == kMaxStates || message.size() > kMaxMessage ||
+      !state.ParseFromArray(message.data(), static_cast<int>(message.size())))
+    return;
+  Json& values = states[beginning(state.name(), kMaxName)] = first_of(state.values(), left, number);
+  left -= values.size();
+}
+
+Json act_json(std::span<const std::byte> act) {
+  Json json = {{"text", ""}, {"embodiment", ""}, {"states", Json::object()}, {"views", Json::array()}};
+  std::size_t n_value = kMaxValues;
+  each_field(act, [&](const wire::Fields& field) {
+    if (field.number == v1::Act::kDeadlineMsFieldNumber && field.type == 'v') json["deadline_ms"] = field.varint;
+    if (field.type != 'b') return;
+    if (field.number == v1::Act::kTextFieldNumber) json["text"] = beginning(view_of(field.value), kMaxText);
+    if (field.number == v1::Act::kEmbodimentFieldNumber) json["embodiment"] = beginning(view_of(field.value), kMaxName);
+    if (field.number == v1::Act::kStatesFieldNumber) add_state(field.value, json["states"], n_value);
+    if (field.number != v1::Act::kViewsFieldNumber || json["views"].size() == kMaxViews) return;
+    const View view = read_view(field.value);
+    json["views"].push_back({{"name", beginning(view.name, kMaxName)}, {"kind", view.kind()}});
+  });
   return json;
+}
+
+/// Frames as pixels; nothing where their number is not what their sides say.
+HttpReply raw_frame(std::span<const std::byte> message) {
+  std::uint64_t width = 0, height = 0;
+  std::string_view rows;
+  each_field(message, [&](const wire::Fields& field) {
+    if (field.number == v1::RawRgb::kWidthFieldNumber) width = field.varint;
+    if (field.number == v1::RawRgb::kHeightFieldNumber) height = field.varint;
+    if (field.number == v1::RawRgb::kRowsFieldNumber && field.type == 'b') rows = view_of(field.value);
+  });
+  const bool is_whole =
+      width > 0 && height > 0 && width <= rows.size() && height <= rows.size() && width * height * 3 == rows.size();
+  if (!is_whole) return {.status = 404, .body = "pixels of other sides\n"};
+  return pixmap(static_cast<std::uint32_t>(width), static_cast<std::uint32_t>(height), rows);
+}
+
+/// The memory that a string takes beside the object itself.
+std::size_t on_heap(const std::string& text) {
+  constexpr std::size_t kInside = 15, kMallocs = 16;
+  return text.capacity() <= kInside ? 0 : text.capacity() + 1 + kMallocs;
 }
 
 }  // namespace
@@ -124,25 +222,50 @@ struct Page::Act {
   std::int64_t at_ms = 0;  // of its receipt, since 1970
   double total_ms = 0;     // from receipt to its answer
   std::string client, name, code;
-  std::string in, out;  // until they are read
-  std::size_t size = 0;
+  std::string in, out;
+  std::size_t size = 0;  // in memory
 
-  v1::Request request;
-  std::string json;  // empty until a viewer asks
+  /// The serialized v1::Act; empty where the request is none.
+  std::span<const std::byte> act() const {
+    const auto request = std::as_bytes(std::span(in));
+    wire::Envelope envelope;
+    wire::read_envelope(request, envelope).ok();  // what was refused is shown too
+    return envelope.kind == wire::Kind::act ? envelope.body(request) : std::span<const std::byte>();
+  }
 
-  void read() {
-    if (!json.empty()) return;
-    v1::Response response;
+  std::string json() const {
     Json all = {{"id", id},         {"at_ms", at_ms}, {"total_ms", total_ms},
                 {"client", client}, {"name", name},   {"code", code}};
-    if (request.ParseFromString(in)) all.update(act_json(request.act()));
-    if (response.ParseFromString(out) && response.has_chunk()) all["chunk"] = chunk_json(response.chunk());
+    all.update(act_json(act()));
+    v1::Response response;
+    if (out.size() > kMaxResponse || !response.ParseFromString(out)) return text_of(all);
+    if (response.has_chunk()) all["chunk"] = chunk_json(response.chunk());
     if (response.has_error())
-      all["error"] = {{"where", response.error().where()},
-                      {"expected", response.error().expected()},
-                      {"found", response.error().found()}};
-    json = text_of(all);
-    in = {}, out = {};
+      all["error"] = {{"where", note_json(response.error().where())},
+                      {"expected", note_json(response.error().expected())},
+                      {"found", note_json(response.error().found())}};
+    return text_of(all);
+  }
+
+  /// The view of this number, or none.
+  std::optional<View> view(std::size_t number) const {
+    std::optional<View> found;
+    each_field(act(), [&](const wire::Fields& field) {
+      if (field.number == v1::Act::kViewsFieldNumber && field.type == 'b' && number-- == 0)
+        found = read_view(field.value);
+    });
+    return found;
+  }
+
+  /// The act as if it had this view alone.
+  v1::Act with(const View& view) const {
+    v1::Act one;
+    one.add_views()->ParseFromArray(view.message.data(), static_cast<int>(view.message.size()));
+    each_field(act(), [&one](const wire::Fields& field) {
+      if (field.number == v1::Act::kEmbodimentFieldNumber && field.type == 'b')
+        one.set_embodiment(std::string(view_of(field.value)));
+    });
+    return one;
   }
 };
 
@@ -201,9 +324,12 @@ bool Page::show(const Recording::Record& record) {
 }
 
 void Page::keep(const std::shared_ptr<Act>& act, std::span<const std::byte> in, std::span<const std::byte> out) {
-  act->size = in.size() + out.size();
-  if (act->size > kMaxBytes) return;
+  constexpr std::size_t kRoom = sizeof(Act) + 64;  // with its count of owners, its place in line, and what malloc adds
+  if (in.size() + out.size() > kMaxBytes) return;
   act->in = text_of(in), act->out = text_of(out);
+  act->size = kRoom;
+  for (const std::string* text : {&act->client, &act->name, &act->code, &act->in, &act->out})
+    act->size += on_heap(*text);
   const std::lock_guard lock(mutex_);
   acts_.push_back(act);
   act->id = ++n_act_;
@@ -261,10 +387,8 @@ HttpReply Page::acts_after(std::uint64_t id) {
   std::string body = text_of(json);
   body.back() = ',';
   body += "\"acts\":[";
-  for (auto act = found.rbegin(); act != found.rend(); ++act) {
-    (*act)->read();
-    body += (act == found.rbegin() ? "" : ",") + (*act)->json;
-  }
+  for (auto act = found.rbegin(); act != found.rend(); ++act)
+    body += (act == found.rbegin() ? "" : ",") + (*act)->json();
   return {.type = "application/json", .body = body + "]}"};
 }
 
@@ -276,32 +400,30 @@ const Result<Frame>& Page::seen(const Act& act, std::size_t view) {
     const std::lock_guard lock(mutex_);
     see = see_;
   }
-  seen_.push_back({act.id, view, see ? see(act.request.act(), static_cast<int>(view)) : no_recipe()});
+  seen_.push_back({act.id, view, see ? see(act.with(*act.view(view)), 0) : no_recipe()});
   if (seen_.size() > kMaxSeen) seen_.pop_front();
   return seen_.back().picture;
 }
 
-HttpReply Page::image(std::uint64_t id, std::size_t view, bool as_seen) {
+HttpReply Page::image(std::uint64_t id, std::size_t number, bool as_seen) {
   std::shared_ptr<Act> act;
   {
     const std::lock_guard lock(mutex_);
     if (!acts_.empty() && id >= acts_.front()->id && id <= n_act_) act = acts_[id - acts_.front()->id];
   }
-  if (act) act->read();
-  if (!act || view >= static_cast<std::size_t>(act->request.act().views_size()))
-    return {.status = 404, .body = "gone, or never there\n"};
+  const std::optional<View> view = act ? act->view(number) : std::nullopt;
+  if (!view) return {.status = 404, .body = "gone, or never there\n"};
   if (as_seen) {
-    const Result<Frame>& picture = seen(*act, view);
+    const Result<Frame>& picture = seen(*act, number);
     if (!picture) return {.status = 404, .body = picture.error().message() + "\n"};
     const auto& rgb = std::get<std::vector<std::uint8_t>>(picture->rgb);
     return pixmap(static_cast<std::uint32_t>(picture->width), static_cast<std::uint32_t>(picture->height),
-                  text_of(std::as_bytes(std::span(rgb))));
+                  view_of(std::as_bytes(std::span(rgb))));
   }
-  const v1::View& found = act->request.act().views(static_cast<int>(view));
-  if (found.has_jpeg()) return {.type = "image/jpeg", .body = found.jpeg()};
-  if (found.has_png()) return {.type = "image/png", .body = found.png()};
-  if (!found.has_rgb()) return {.status = 404, .body = "absent\n"};
-  return pixmap(found.rgb().width(), found.rgb().height(), found.rgb().rows());
+  const std::string kind = view->kind();
+  if (kind == "rgb") return raw_frame(view->bytes);
+  if (kind == "absent") return {.status = 404, .body = "absent\n"};
+  return {.type = "image/" + kind, .body = text_of(view->bytes)};
 }
 
 }  // namespace vla::serve

@@ -19,8 +19,8 @@ namespace vla::serve {
 /// A live page for people: `/` is the page, which asks `/policy` once, `/acts?after=N` for what was answered since, and
 /// `/image?act=N&view=I` for frames, `&as=seen` for what the network got of them. POST to `/record?on=1` or `on=0`
 /// begins and ends a recording. Every request needs `token=`, which is drawn anew for each server and is no other
-/// secret, since browsers keep addresses. The last acts are kept, up to a size; a viewer that falls behind misses some,
-/// and holds nothing up.
+/// secret, since browsers keep addresses. The last acts are kept, up to a size in memory; a viewer that falls behind
+/// misses some, and holds nothing up. Of a refused act, which may hold anything, only the beginning is told.
 class Page final : public Observer {
  public:
   struct Range {
@@ -33,7 +33,7 @@ class Page final : public Observer {
     Recordings* recordings = nullptr;  // of the server, where it was given a folder for them
     bool is_server = true;             // and not a recording that is shown
   };
-  /// What the network gets of an act's view, as a picture of 8 bits. Errors: bad_observation, too_large.
+  /// What the network gets of a view of this act, as a picture of 8 bits. Errors: bad_observation, too_large.
   using See = std::function<Result<Frame>(const v1::Act& act, int view)>;
   /// As Http::open.
   static Result<std::unique_ptr<Page>> open(const std::string& address, bool insecure, Sources sources);
@@ -50,8 +50,11 @@ class Page final : public Observer {
   /// For a browser.
   std::string url() const;
 
-  /// An answered act. What is derived from the bytes is made when the first viewer asks, on the thread of Http.
+  /// An answered act, as the bytes that went over the wire. What is told of them is made when a viewer asks, on the
+  /// thread of Http.
   struct Act;
+  /// Of the acts that are kept, with what each takes beside its bytes.
+  static constexpr std::size_t kMaxBytes = 96 << 20;
 
  private:
   explicit Page(Sources sources) : sources_(std::move(sources)) {}
