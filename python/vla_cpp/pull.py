@@ -2,23 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """vla-pull: bundles of the hub, into the cache of huggingface_hub, from which every command takes them by name.
 
-The library resumes what was cut off, follows redirects and keeps a file under its hash. The hash is checked here, and at every load the
-bundle's own checksum.
+What was cut off, also by a kill, is continued by the next run. A file is kept under its SHA-256, which is checked at every run, and at every
+load the bundle's own checksum is.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
-import re
 import sys
 from pathlib import Path
 from typing import Any, Iterator, List, Optional, Tuple
 
 from .convert.errors import Code, ConvertError
-from .convert.files import HUB, HUB_FORM, hub_folder
+from .convert.hub import HUB, HUB_FORM, hub_folder
 from .errors import IoError, UsageError, VlaError
 from .installed import extra_hint
+from .printable import printable
 
 PATTERN = "*.gguf"
 EPILOG = """examples:
@@ -29,31 +28,14 @@ Exit codes: 0 done, 2 usage, 9 a file or the hub."""
 
 
 def pull(source: str) -> List[Path]:
-    """The bundles of a repository, downloaded where they are not yet. Errors: ConvertError (hub), IoError (none, or other bytes)."""
-    folder = hub_folder(source, [PATTERN])
+    """The bundles of a repository, downloaded where they are not yet. Errors: ConvertError (form, hub, other bytes), IoError (none)."""
+    folder = hub_folder(source, [PATTERN], again=True)
     if folder is None:
         raise UsageError(source, HUB_FORM, "another form")
     files = sorted(Path(folder.folder).glob(PATTERN))
     if not files:
         raise IoError(source, "a repository with a .gguf file", "none")
-    for file in files:
-        _check(file)
     return files
-
-
-def _check(file: Path) -> None:
-    """A large file lies in the cache under the SHA-256 that the hub states."""
-    blob = file.resolve()
-    if not re.fullmatch("[0-9a-f]{64}", blob.name):
-        return
-    digest = hashlib.sha256()
-    with open(blob, "rb") as data:
-        for part in iter(lambda: data.read(1 << 20), b""):
-            digest.update(part)
-    if digest.hexdigest() != blob.name:
-        file.unlink()
-        blob.unlink()
-        raise IoError(file.name, f"bytes of SHA-256 {blob.name}", digest.hexdigest(), "they were removed: run vla-pull again")
 
 
 def _bundles() -> Iterator[Tuple[str, Any, Any]]:
@@ -75,7 +57,7 @@ def _bundles() -> Iterator[Tuple[str, Any, Any]]:
 def show() -> None:
     for name, _, revision in _bundles():
         files = ", ".join(sorted(f.file_name for f in revision.files if f.file_name.endswith(".gguf")))
-        print(f"{name}  {revision.size_on_disk / 1e6:.1f} MB  {files}")
+        print(printable(f"{name}  {revision.size_on_disk / 1e6:.1f} MB  {files}"))
 
 
 def remove(source: str) -> None:
@@ -87,7 +69,7 @@ def remove(source: str) -> None:
         raise IoError(source, "one of " + (", ".join(names) or "none: the cache has no bundle"), "another name")
     plan = scan_cache_dir().delete_revisions(names[source].commit_hash)
     plan.execute()
-    print(f"removed {source}, {plan.expected_freed_size / 1e6:.1f} MB")
+    print(printable(f"removed {source}, {plan.expected_freed_size / 1e6:.1f} MB"))
 
 
 def main(argv: Optional[List[str]] = None) -> int:

@@ -10,6 +10,7 @@ import pytest
 
 from tiny import write_json, write_safetensors
 from vla_cpp.convert import Code, ConvertError, Options, convert_checkpoint
+from vla_cpp.convert.cli import main
 
 BAD, IO = Code.BAD_BUNDLE, Code.IO
 
@@ -137,6 +138,17 @@ def test_a_smolvla_without_its_backbones_files_is_refused_with_the_pinned_reposi
     shutil.rmtree(converter.folder / "vlm")
     hint = "run vla-convert again with --backbone hub:HuggingFaceTB/SmolVLM2-500M-Video-Instruct@7b375e1b73b11138ff12fe22c8f2822d8fe03467"
     assert converter.refusal().message().endswith(hint)
+
+
+def test_a_folder_of_this_machine_that_a_checkpoint_names_is_not_read_unless_the_option_says_so(converter, tiny, tmp_path):
+    outside = tmp_path / "outside"
+    tiny.config["vlm_model_name"] = str(outside)
+    converter.save(tiny)
+    (converter.folder / "vlm").rename(outside)
+    message = converter.refusal().message()
+    assert "expected --backbone DIR, or vlm/ inside the checkpoint" in message
+    assert message.endswith("where that folder is the one you mean, run vla-convert again with --backbone {}".format(outside))
+    assert main([str(converter.folder), "-o", str(converter.out), "--quiet", "--backbone", str(outside)]) == 0
 
 
 def test_a_declared_tokenizer_folder_that_is_missing_is_refused(converter, tiny):

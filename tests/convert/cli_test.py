@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pytest
 
+import vla_cpp.convert.hub
 from vla_cpp.convert import read_bundle
 from vla_cpp.convert.cli import main, report
 from vla_cpp.convert.conversion import Summary
@@ -225,15 +226,13 @@ def test_damaged_json_is_converted_or_refused_but_never_a_fault(converter, tiny,
 @pytest.fixture
 def hub(monkeypatch, tmp_path):
     """A hub of two repositories, whose cache keeps a snapshot in a folder that is named by its commit. The list has what was asked."""
-    import huggingface_hub
-
     asked = []
 
-    def download(repo, revision, allow_patterns):
-        asked.append((repo, revision, tuple(allow_patterns)))
+    def download(source, repo, revision, patterns, again):
+        asked.append((repo, revision, tuple(patterns)))
         return str(tmp_path / repo.replace("/", "--") / "0123abc")
 
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    monkeypatch.setattr(vla_cpp.convert.hub, "fetched", download)
     return asked
 
 

@@ -16,7 +16,8 @@ from .adapters import WEIGHTS_FILE as ADAPTER_WEIGHTS
 from .adapters import Adapter, base_of, is_adapter_name, parse, read_adapter
 from .dtypes import STATISTICS, to_f32
 from .errors import Code, Problems, refuse
-from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_PATTERNS, hub_folder, plain_name, read_json
+from .files import plain_name, read_json
+from .hub import BACKBONE_PATTERNS, HUB_FORM, HUB_PATTERNS, hub_folder
 from .instead import check_is_policy, instead_of
 from .options import Option
 from .safetensors_file import Entry, read_safetensors
@@ -266,25 +267,29 @@ def given_backbone(checkpoint: Checkpoint, given: str) -> str:
 
 
 def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_model_name", own: str = "vlm") -> str:
-    """The folder with the backbone's config.json: as given, `own` inside the checkpoint, or the one that the policy's config states."""
+    """The folder with the backbone's config.json: as given, `own` inside the checkpoint."""
     if given:
         return given
     inside = checkpoint.path(own)
     if os.path.exists(os.path.join(inside, "config.json")):
         checkpoint.notes.append("backbone config and tokenizer: from {}/ inside the checkpoint".format(own))
         return inside
-    if isinstance(named, str) and os.path.isabs(named) and os.path.isdir(named):
-        checkpoint.notes.append("backbone config and tokenizer: from the folder {} that config.json names".format(os.path.basename(named)))
-        return named
     raise refuse(
         "backbone {}, which config.json: {} names".format(str(named)[:100], key),
         "--backbone DIR, or {}/ inside the checkpoint".format(own),
         "neither",
-        "run vla-convert again with --backbone hub:{}@{}".format(named, BACKBONES[named])
-        if isinstance(named, str) and named in BACKBONES
-        else "--backbone {} fetches it from the hub".format(HUB_FORM),
+        _backbone_hint(named),
         Code.IO,
     )
+
+
+def _backbone_hint(named) -> str:
+    """A checkpoint may come from anyone, so that no folder of this machine is read because its config names it."""
+    if isinstance(named, str) and named in BACKBONES:
+        return "run vla-convert again with --backbone hub:{}@{}".format(named, BACKBONES[named])
+    if isinstance(named, str) and os.path.isabs(named):
+        return "where that folder is the one you mean, run vla-convert again with --backbone {}".format(named)
+    return "--backbone {} fetches it from the hub".format(HUB_FORM)
 
 
 def read_statistic(entry: Entry) -> np.ndarray:

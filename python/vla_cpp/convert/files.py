@@ -1,40 +1,18 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""JSON files and hub folders, read with refusals that name the file."""
+"""Files of a checkpoint, read with refusals that name the file."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import stat
-from typing import BinaryIO, NamedTuple, Optional
+from typing import BinaryIO
 
 from ..installed import extra_hint
 from .errors import Code, ConvertError, refuse
 
 MAX_JSON = 256 << 20  # the tokenizers of the largest vocabularies take some 20 MB
-HUB_PATTERNS = [
-    "*.json",
-    "*.safetensors",
-    "mp_rank_00_model_states.pt",
-    "*_checkpoint.pt",
-    "tokenizer/*",
-    "vlm/*.json",
-    "vlm/merges.txt",
-    "processor/*.json",
-    "assets/*",
-]
-BACKBONE_PATTERNS = [
-    "config.json",
-    "tokenizer.json",
-    "tokenizer_config.json",
-    "vocab.json",
-    "merges.txt",
-    "added_tokens.json",
-    "preprocessor_config.json",
-    "chat_template.*",
-]
 
 
 def _no_constant(name: str):
@@ -101,43 +79,6 @@ def member(value: dict, key: str, kind: type, where: str):
 def plain_name(name) -> bool:
     """Whether a file name that a checkpoint states stays inside the checkpoint's folder."""
     return isinstance(name, str) and bool(name) and name not in (".", "..") and not set(name) & set("/\\\0")
-
-
-HUB = "hub:"
-HUB_FORM = "hub:OWNER/NAME@REVISION"
-HUB_NAME = r"\w[\w.-]*/\w[\w.-]*"
-
-
-class HubFolder(NamedTuple):
-    """A repository of the hub in the local cache, and the commit that its revision was when it was asked for."""
-
-    folder: str
-    repo: str
-    commit: str
-
-
-def hub_folder(source: str, patterns) -> Optional[HubFolder]:
-    """None for a source that is a folder. Nothing is ever downloaded that does not say so, revision included. Errors: usage, io."""
-    if not source.startswith(HUB):
-        return None
-    found = re.fullmatch("({})@(\\w[\\w./-]*)".format(HUB_NAME), source[len(HUB) :])
-    if not found:
-        hint = "a revision is a commit, tag or branch, such as main; the bundle records the commit"
-        raise refuse(source, HUB_FORM, "another form", hint, Code.USAGE)
-    folder = _download(source, found[1], found[2], patterns)
-    return HubFolder(folder, found[1], os.path.basename(folder))
-
-
-def _download(source: str, repo: str, revision: str, patterns) -> str:
-    try:
-        from huggingface_hub import snapshot_download
-
-        return snapshot_download(repo, revision=revision, allow_patterns=patterns)
-    except ImportError:
-        raise missing_extra("huggingface_hub")
-    except Exception as error:  # noqa: BLE001 - the library has a class for every kind of failure
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise refuse(source, "a reachable hub repository", reason[:200], "download it and give the folder", Code.IO)
 
 
 def missing_extra(package: str) -> ConvertError:

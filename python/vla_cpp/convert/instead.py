@@ -9,7 +9,7 @@ import os
 import re
 
 from .errors import Code, refuse
-from .files import HUB_NAME
+from .hub import HUB_NAME
 
 POLICY = "pretrained_model"  # where LeRobot's training saves a policy
 # Below the folder of a checkpoint, of a run, and of runs by name or by date and time.

@@ -13,7 +13,7 @@ from .bundle import Key
 from .checkpoint import Checkpoint
 from .errors import Code, Problems, refuse
 from .features import views_of
-from .files import HUB_FORM
+from .hub import HUB_FORM
 from .section import Section
 
 EMPTY_CAMERA = "observation.images.empty_camera_"
