@@ -21,6 +21,8 @@ from .observation import place, robot_of
 from .spec import Spec
 
 FILE = "requests.vlarec"
+_LATEST_NS = 4_102_444_800 * 10**9  # 2100; what programs count in nanoseconds from 1970 has to end somewhere
+_LONGEST_MS = 1e9  # from a receipt to its answer
 _MAGIC = b"VLAREC2\n"
 _HEAD, _SEAL = struct.Struct("<4sIIIQQ"), struct.Struct("<Q")
 
@@ -93,6 +95,8 @@ class Recording:
             digest = xxhash.xxh3_64_intdigest(part, digest)
         if _SEAL.pack(digest) != seal:
             raise self._damaged(index, at, "bytes of the checksum that was recorded", "bytes of another")
+        if received_ns >= _LATEST_NS:
+            raise self._damaged(index, at, "a time before the year 2100", f"{received_ns} ns since 1970")
         if mark == b"VEND":
             if file.tell() != size:
                 raise self._damaged(index, file.tell(), "the end of the file", f"{size - file.tell()} bytes more")
@@ -132,8 +136,12 @@ class RecordedAct:
     @property
     def ready_ns(self) -> int:
         """When the answer was there, since 1970."""
-        took = self.answer.queue_ms + sum(self.answer.timing.values()) if isinstance(self.answer, Chunk) else 0
-        return self.record.received_ns + int(took * 1e6)
+        took_ms = _took_ms(self.answer) if isinstance(self.answer, Chunk) else 0
+        return self.record.received_ns + int(took_ms * 1e6)
+
+
+def _took_ms(chunk: Chunk) -> float:
+    return chunk.queue_ms + sum(chunk.timing.values())
 
 
 def acts_of(recording: Recording, first: Optional[int] = None) -> Iterator[RecordedAct]:
@@ -163,6 +171,8 @@ def _answered(record: Record, spec: Spec, act: Any, chunk: Chunk) -> RecordedAct
     widths = {state.name: state.width for state in spec.states}
     if {name: len(values) for name, values in states.items()} != widths or chunk.actions.shape[1] != spec.d_action:
         raise ValueError("states or actions of other widths")
+    if not 0 <= _took_ms(chunk) < _LONGEST_MS:
+        raise ValueError(f"stages that took {_took_ms(chunk)} ms")
     images = {place("view", v.name, spec.views): _image(v) for v in act.views if v.WhichOneof("image") != "absent"}
     return RecordedAct(record, spec, images, states, act.text, chunk)
 

@@ -17,6 +17,7 @@ namespace {
 constexpr std::string_view kMagic = "VLAREC2\n";
 constexpr std::size_t kHead = 40, kSealed = 32;  // bytes of a record before its request; of them under the checksum
 constexpr std::size_t kMaxRecordBacklog = 128 << 20;
+constexpr std::uint64_t kLatestNs = 4'102'444'800 * 1'000'000'000ULL;  // 2100: a record whose pace can be kept
 
 using Head = std::array<char, kHead>;
 
@@ -174,6 +175,8 @@ Result<std::optional<Recording::Record>> Recording::next() {
   file_.read(record.response.data(), static_cast<std::streamsize>(n_out));
   if (!file_ || seal(head, record.request, record.response) != get<std::uint64_t>(head, kSealed))
     return damaged("bytes of the checksum that was recorded", "bytes of another");
+  if (record.at_ns >= kLatestNs)
+    return damaged("a time before the year 2100", fmt::format("{} ns since 1970", record.at_ns));
   at_ += kHead + n_in + n_out;
   if (mark == "VEND") {
     is_whole_ = true;

@@ -9,12 +9,13 @@ import time
 
 import numpy as np
 import pytest
+import xxhash
 from PIL import Image
 from server_process import SECONDS, Server, frames
 
 import vla_cpp
 from vla_cpp.export.cli import main
-from vla_cpp.recording import FILE, Recording, acts_of
+from vla_cpp.recording import _HEAD, _MAGIC, _SEAL, FILE, Recording, acts_of
 
 FPS = 5
 
@@ -186,6 +187,39 @@ def test_a_damaged_recording_is_refused_wherever_the_damage_is(recorded, tmp_pat
     assert main([str(tmp_path), "--mcap", str(tmp_path / "out.mcap")]) == 11
     error = capsys.readouterr().err
     assert "--first" in error and not (tmp_path / "out.mcap").exists() and not (tmp_path / "out.mcap.part").exists()
+
+
+def with_time(data, received_ns):
+    """A recording whose first act came at another time, with a seal that fits."""
+    at = len(_MAGIC)
+    for _ in range(2):  # the description, and what is the first request
+        begin = at
+        head = list(_HEAD.unpack_from(data, at))
+        at += _HEAD.size + _SEAL.size + head[2] + head[3]
+    head[5] = received_ns
+    sealed = _HEAD.pack(*head)
+    rest = data[begin + _HEAD.size + _SEAL.size : at]
+    digest = 0
+    for part in (sealed, rest[: head[2]], rest[head[2] :]):
+        digest = xxhash.xxh3_64_intdigest(part, digest)
+    return data[:begin] + sealed + _SEAL.pack(digest) + rest + data[at:]
+
+
+@pytest.mark.parametrize("received_ns", [2**64 - 1, 2**63, 4_102_444_800 * 10**9])
+def test_a_time_that_no_format_can_hold_is_refused(recorded, tmp_path, capsys, received_ns):
+    (tmp_path / FILE).write_bytes(with_time((recorded[0] / FILE).read_bytes(), received_ns))
+    for option in (["--mcap", tmp_path / "x"], ["--rrd", tmp_path / "x"], ["--lerobot", tmp_path / "x", "--fps", "5"]):
+        assert main([str(tmp_path), *map(str, option)]) == 11
+        assert f"expected a time before the year 2100, found {received_ns} ns since 1970" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+    (tmp_path / FILE).write_bytes(with_time((recorded[0] / FILE).read_bytes(), received_ns % 10**18))
+    assert main([str(tmp_path), "--mcap", str(tmp_path / "y")]) == 0
+
+
+def test_what_an_export_that_was_killed_has_left_is_not_in_the_way(recorded, tmp_path):
+    (tmp_path / "x.mcap.part").mkdir()
+    assert main([str(recorded[0]), "--mcap", str(tmp_path / "x.mcap")]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["x.mcap"]
 
 
 def test_wrong_arguments_are_refused(recorded, tmp_path, capsys):

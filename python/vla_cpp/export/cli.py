@@ -101,6 +101,7 @@ def _file(path: Path, write: Any) -> None:
 def _folder(path: Path, write: Any) -> Any:
     """Writes beside `path`, and gives it its name when it is whole."""
     part = path.with_name(path.name + ".part")
+    _remove(part)  # of an export that was killed
     try:
         result = write(part)
         os.replace(part, path)
@@ -108,8 +109,14 @@ def _folder(path: Path, write: Any) -> Any:
     except OSError as problem:
         raise IoError(str(path), "a place to write", str(problem)) from None
     finally:
-        if part.is_dir():
-            shutil.rmtree(part)
+        _remove(part)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    elif path.exists():
+        path.unlink()
 
 
 def main(argv: Optional[List[str]] = None) -> int:
