@@ -4,6 +4,7 @@
 
 #include <fcntl.h>
 #include <fmt/format.h>
+#include <sys/file.h>
 #include <unistd.h>
 
 #include <cerrno>
@@ -11,23 +12,60 @@
 #include <filesystem>
 #include <fstream>
 #include <random>
+#include <string_view>
 
 namespace vla {
 namespace {
+
+constexpr std::string_view kPart = ".part";
 
 Error cannot_write(const std::string& path, int number) {
   return {Code::io, path, "a file that can be written", std::strerror(number)};
 }
 
+/// A file of this folder without a name, of which nothing is left where the program is killed; -1 where the system has
+/// none.
+int open_unnamed(const std::string& folder, unsigned mode) {
+  if (::access("/proc/self/fd", X_OK) != 0) return -1;  // which names it in the end
+  return ::open(folder.empty() ? "." : folder.c_str(), O_TMPFILE | O_RDWR | O_CLOEXEC, mode);
+}
+
+bool give_name(int fd, const std::string& path) {
+  const std::string unnamed = fmt::format("/proc/self/fd/{}", fd);
+  return ::linkat(AT_FDCWD, unnamed.c_str(), AT_FDCWD, path.c_str(), AT_SYMLINK_FOLLOW) == 0;
+}
+
+/// A file that has its name from the start, locked for as long as it is written.
+int open_named(const std::string& path, unsigned mode) {
+  const int fd = ::open(path.c_str(), O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, mode);
+  if (fd >= 0) ::flock(fd, LOCK_EX | LOCK_NB);
+  return fd;
+}
+
 Status write_new(const std::string& path, const WriteTo& write, unsigned mode) {
-  const int fd = ::open(path.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, mode);
+  const int unnamed = open_unnamed(std::filesystem::path(path).parent_path().string(), mode);
+  const int fd = unnamed >= 0 ? unnamed : open_named(path, mode);
   if (fd < 0) return cannot_write(path, errno);
-  bool written = write(fd) && ::fsync(fd) == 0;
+  bool written = write(fd) && ::fsync(fd) == 0 && (unnamed < 0 || give_name(fd, path));
   int number = errno;
   if (::close(fd) != 0 && written) written = false, number = errno;
   if (written) return {};
-  ::unlink(path.c_str());
+  if (unnamed < 0) ::unlink(path.c_str());
   return cannot_write(path, number);
+}
+
+/// Removes what programs that were killed have left of this file: parts that nobody writes any more.
+void remove_stale_parts(const std::filesystem::path& target) {
+  std::error_code ignored;
+  const std::filesystem::path folder = target.parent_path();
+  for (const auto& entry : std::filesystem::directory_iterator(folder.empty() ? "." : folder, ignored)) {
+    const std::string name = entry.path().filename().string(), stem = target.filename().string() + ".";
+    if (!name.starts_with(stem) || !name.ends_with(kPart) || name.size() != stem.size() + 8 + kPart.size()) continue;
+    const int fd = ::open(entry.path().c_str(), O_RDONLY | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK);
+    if (fd < 0) continue;
+    if (::flock(fd, LOCK_EX | LOCK_NB) == 0) ::unlink(entry.path().c_str());
+    ::close(fd);
+  }
 }
 
 Status write_in_place(const std::string& path, const WriteTo& write) {
@@ -78,7 +116,8 @@ Status write_file(const std::string& path, const WriteTo& write) {
   if (std::filesystem::exists(there) && !std::filesystem::is_regular_file(there)) return write_in_place(path, write);
   const bool is_link = std::filesystem::is_symlink(std::filesystem::symlink_status(path, ignored));
   const std::string target = is_link ? std::filesystem::weakly_canonical(path, ignored).string() : path;
-  const std::string part = fmt::format("{}.{:08x}.part", target, std::random_device()());
+  remove_stale_parts(target);
+  const std::string part = fmt::format("{}.{:08x}{}", target, std::random_device()(), kPart);
   if (const Status written = write_new(part, write, 0666); !written)
     return Error{Code::io, path, written.error().expected, written.error().found};
   if (::rename(part.c_str(), target.c_str()) == 0) return {};

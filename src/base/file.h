@@ -18,7 +18,8 @@ Result<std::vector<std::byte>> read_file(const std::string& path, std::size_t li
 /// Writes a file that is not there yet, whole or not at all. Errors: io.
 Status write_new_file(const std::string& path, std::span<const std::byte> bytes, unsigned mode);
 /// Writes a file whole or not at all: the bytes go into a new file beside it, which takes its name when all of them are
-/// on the disk. What is no regular file, such as a pipe, is written to as it is. Errors: io.
+/// on the disk. A program that is killed leaves nothing, or, on file systems without files that have no name, a part
+/// which the next one removes. What is no regular file, such as a pipe, is written to as it is. Errors: io.
 Status write_file(const std::string& path, std::span<const std::byte> bytes);
 /// The same of bytes that `write` writes to an open file; it returns false, with errno set, where it could not.
 using WriteTo = std::function<bool(int file)>;

@@ -5,7 +5,9 @@
 #include <fmt/format.h>
 #include <unistd.h>
 
+#include <csignal>
 #include <filesystem>
+#include <optional>
 
 #include "cli/commands.h"
 #include "cli/say.h"
@@ -177,6 +179,36 @@ Status calibrate_first(QuantizeOptions options) {
   VLA_TRY(const Bundle int4, Bundle::open(made.int4));
   return write_codes(options, {.feedback = {}, .made = &int4}, made.why);
 }
+
+/// The bundles that are made on the way, beside the result: gone before it begins, since a program that was killed may
+/// have left some, at its end, and where a signal ends it.
+class Trials {
+ public:
+  explicit Trials(const std::string& to) {
+    for (const char* ending : {".smoothed", ".int4", ".trial"}) files_.push_back(to + ending);
+    remove();
+    struct sigaction action = {};
+    action.sa_handler = [](int signal) {
+      remove();
+      std::signal(signal, SIG_DFL);
+      std::raise(signal);
+    };
+    for (const int signal : {SIGINT, SIGTERM, SIGHUP}) {
+      struct sigaction before = {};
+      sigaction(signal, nullptr, &before);
+      if (before.sa_handler != SIG_IGN) sigaction(signal, &action, nullptr);
+    }
+  }
+  ~Trials() { remove(); }
+  Trials(const Trials&) = delete;
+  Trials& operator=(const Trials&) = delete;
+
+ private:
+  static void remove() {
+    for (const std::string& file : files_) ::unlink(file.c_str());
+  }
+  static inline std::vector<std::string> files_;  // which do not change any more once a signal may come
+};
 #endif
 
 Status run(const QuantizeOptions& options) {
@@ -184,11 +216,9 @@ Status run(const QuantizeOptions& options) {
   if (std::filesystem::exists(options.to, ignored) && !options.force)
     return Error{Code::usage, options.to, "a new file", "one that exists", "name another, or --force"};
 #ifdef VLA_SERVER
-  if (!options.calibration.empty()) {
-    const Status written = calibrate_first(options);
-    for (const char* ending : {".smoothed", ".int4", ".trial"}) std::filesystem::remove(options.to + ending, ignored);
-    return written;
-  }
+  std::optional<Trials> trials;
+  if (!options.calibration.empty() || !options.recording.empty()) trials.emplace(options.to);
+  if (!options.calibration.empty()) return calibrate_first(options);
 #endif
   return write_codes(options, {}, "");
 }

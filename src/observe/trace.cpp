@@ -3,16 +3,21 @@
 #include "observe/trace.h"
 
 #include <fmt/format.h>
+#include <unistd.h>
 
 #include <algorithm>
+#include <cerrno>
 #include <cmath>
 #include <cstring>
 #include <exception>
+
+#include "base/file.h"
 
 namespace vla::serve {
 namespace {
 
 constexpr std::size_t kMaxTraceBacklog = 16 << 20;
+constexpr std::size_t kMaxTail = 128;           // bytes
 constexpr int kIo = 1, kEngine = 2, kHost = 3;  // tracks
 
 /// Trace events count in microseconds; three digits keep the nanoseconds, so that what nests still nests.
@@ -20,6 +25,12 @@ std::string us(std::int64_t ns) { return fmt::format("{}.{:03}", ns / 1000, ns %
 
 std::string name_of_thread(int tid, const char* name) {
   return fmt::format(R"({{"ph":"M","pid":1,"tid":{},"name":"thread_name","args":{{"name":"{}"}}}})", tid, name);
+}
+
+/// The names of the tracks.
+std::string head_of_file() {
+  return "[\n" + name_of_thread(kIo, "requests") + ",\n" + name_of_thread(kEngine, "engine") + ",\n" +
+         name_of_thread(kHost, "host, beside a device") + ",\n";
 }
 
 /// Begin and end of a slice on a request's own track.
@@ -64,23 +75,28 @@ std::string slices_of_act(const Answered& answered, std::int64_t from, std::int6
 
 Result<std::unique_ptr<Trace>> Trace::open(const std::string& path, std::size_t max_bytes) {
   VLA_TRY(const int fd, open_to_write(path, false));
+  // With room for the end, which the first events take the place of.
+  const std::string head = head_of_file(), begun = head + std::string(kMaxTail, ' ');
+  if (!write_all(fd, std::as_bytes(std::span(begun))) || ::lseek(fd, static_cast<off_t>(head.size()), SEEK_SET) < 0) {
+    const int number = errno;
+    ::close(fd);
+    return Error{Code::io, path, "a file that can be written", std::strerror(number)};
+  }
   std::unique_ptr<Trace> trace(new Trace(fd, max_bytes));
   if (const int failure = trace->writer_.failure(); failure != 0)
     return Error{Code::io, path, "a thread to write it", std::strerror(failure)};
   return trace;
 }
 
-Trace::Trace(int fd, std::size_t max_bytes) : max_bytes_(max_bytes), writer_(fd, Writer::Owns::yes, kMaxTraceBacklog) {
-  writer_.put("[\n" + name_of_thread(kIo, "requests") + ",\n" + name_of_thread(kEngine, "engine") + ",\n" +
-              name_of_thread(kHost, "host, beside a device") + ",\n");
-}
+Trace::Trace(int fd, std::size_t max_bytes) : max_bytes_(max_bytes), writer_(fd, Writer::Owns::yes, kMaxTraceBacklog) {}
 
-/// An array needs an element after the last comma.
+/// An array needs an element after the last comma, also where the disk is full: every event is longer than this.
 Trace::~Trace() {
   writer_.set_tail(
       fmt::format(R"({{"ph":"M","pid":1,"name":"process_name","args":{{"name":"vla serve","dropped":{}}}}})"
                   "\n]\n",
-                  n_dropped()));
+                  n_dropped()),
+      true);
 }
 
 std::int64_t Trace::ns(Clock::time_point time) const {

@@ -11,8 +11,8 @@
 namespace vla::serve {
 
 /// Events for Perfetto and chrome://tracing: a track of each request from receipt to answer with its time in the queue,
-/// and the acts of the engine with their stages. Streams to the file: an array that Perfetto reads also where a killed
-/// process has not closed it.
+/// and the acts of the engine with their stages. Streams to the file: an array that is whole also where the disk is
+/// full, and that Perfetto reads also where a killed process has not closed it.
 class Trace final : public Observer {
  public:
   static constexpr std::size_t kMaxBytes = std::size_t{1} << 30;

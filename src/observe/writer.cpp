@@ -36,6 +36,7 @@ Result<int> open_to_write(const std::string& path, bool fresh) {
 Writer::Writer(int fd, Owns owns, std::size_t max_waiting) : fd_(fd), owns_(owns), max_waiting_(max_waiting) {
   struct stat info;
   is_file_ = ::fstat(fd, &info) == 0 && S_ISREG(info.st_mode) && owns == Owns::yes;
+  if (is_file_) position_ = last_ = ::lseek(fd, 0, SEEK_CUR);
   auto thread = start_thread("writer", [this] { run(); });
   if (thread) {
     thread_ = std::move(*thread);
@@ -52,7 +53,7 @@ Writer::~Writer() {
   }
   changed_.notify_one();
   if (thread_.joinable()) thread_.join();
-  write_all(tail_);
+  write_tail();
   if (owns_ == Owns::yes) ::close(fd_);
 }
 
@@ -113,10 +114,21 @@ void Writer::write_all(const std::string& piece) {
     }
   }
   if (failure_ == 0) {
+    last_ = position_;
     position_ += static_cast<std::int64_t>(piece.size());
   } else if (!piece.empty()) {
     ++n_dropped_;
     if (is_file_ && ::ftruncate(fd_, position_) != 0) return;  // a full disk keeps the whole pieces
+  }
+}
+
+/// A disk that is full still has the place of the last piece.
+void Writer::write_tail() {
+  write_all(tail_);
+  if (failure_ == 0 || !is_file_ || !over_last_) return;
+  for (const std::int64_t at : {position_, last_}) {
+    if (::pwrite(fd_, tail_.data(), tail_.size(), at) != static_cast<ssize_t>(tail_.size())) continue;
+    if (::ftruncate(fd_, at + static_cast<std::int64_t>(tail_.size())) == 0) return;
   }
 }
 

@@ -34,8 +34,9 @@ class Writer {
 
   /// From any thread. False where the piece was dropped.
   bool put(std::string piece) noexcept;
-  /// Sets the text that comes after every piece that was put, and is not dropped.
-  void set_tail(std::string tail) { tail_ = std::move(tail); }
+  /// Sets the text that comes after every piece that was put, and is not dropped. Where the disk is full, nothing comes
+  /// after what is there; or, `over_last`, the text takes the place of the last piece of a file.
+  void set_tail(std::string tail, bool over_last = false) { tail_ = std::move(tail), over_last_ = over_last; }
   std::uint64_t n_dropped() const { return n_dropped_; }
   /// The system's number of what went wrong; from then on everything is dropped.
   int failure() const { return failure_; }
@@ -43,14 +44,16 @@ class Writer {
  private:
   void run();
   void write_all(const std::string& piece);
+  void write_tail();
   bool is_out_of_patience() const;
 
   const int fd_;
   const Owns owns_;
   const std::size_t max_waiting_;
   bool is_file_ = false;
-  std::int64_t position_ = 0;  // of a file: where the next whole piece goes
+  std::int64_t position_ = 0, last_ = 0;  // of a file: where the next whole piece goes, and where the last one begins
   std::string tail_;
+  bool over_last_ = false;
   std::atomic<std::uint64_t> n_dropped_ = 0;
   std::atomic<int> failure_ = 0;
   mutable std::mutex mutex_;

@@ -3,10 +3,15 @@
 #include "base/file.h"
 
 #include <doctest/doctest.h>
+#include <fcntl.h>
 #include <fmt/format.h>
+#include <sys/file.h>
 #include <sys/stat.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
+#include <csignal>
+#include <cstdlib>
 #include <filesystem>
 
 using namespace vla;
@@ -38,6 +43,40 @@ TEST_CASE("what is written is read back, and replaces a file as a whole") {
   REQUIRE(write_file(file, "short").ok());
   CHECK(text_of(file) == "short");
   CHECK(folder.n_entry() == 1);  // the file beside it is gone
+}
+
+TEST_CASE("a program that is killed while it writes leaves the old file, and after the next one nothing else") {
+  const Folder folder;
+  const std::string file = folder / "a";
+  REQUIRE(write_file(file, "old").ok());
+  const pid_t child = ::fork();
+  if (child == 0) {
+    const std::string half = "half";
+    [[maybe_unused]] const Status never = write_file(file, [&](int to) {
+      write_all(to, std::as_bytes(std::span(half)));
+      return std::raise(SIGKILL) == 0;
+    });
+    std::_Exit(0);
+  }
+  int status = 0;
+  REQUIRE(::waitpid(child, &status, 0) == child);
+  CHECK(WIFSIGNALED(status));
+  CHECK(text_of(file) == "old");
+  REQUIRE(write_file(file, "new").ok());
+  CHECK(text_of(file) == "new");
+  CHECK(folder.n_entry() == 1);
+}
+
+TEST_CASE("parts that nobody writes any more go, and those of a running program and other files stay") {
+  const Folder folder;
+  for (const char* name : {"a.0123abcd.part", "a.89abcdef.part", "a.part", "b.0123abcd.part", "a.0123abcd.part.old"})
+    REQUIRE(write_file(folder / name, "half").ok());
+  const int running = ::open((folder / "a.89abcdef.part").c_str(), O_RDONLY | O_CLOEXEC);
+  REQUIRE(::flock(running, LOCK_EX | LOCK_NB) == 0);
+  REQUIRE(write_file(folder / "a", "whole").ok());
+  CHECK_FALSE(fs::exists(folder / "a.0123abcd.part"));
+  CHECK(folder.n_entry() == 5);
+  ::close(running);
 }
 
 TEST_CASE("a link stays a link, and the file behind it is replaced") {

@@ -93,6 +93,7 @@ def test_a_server_on_a_full_disk_stops_recording_and_answers_on(vla, golden, tmp
     code, _, log = server.stop(signal.SIGTERM)
     events = [json.loads(line)["event"] for line in log.splitlines()]
     assert code == 0 and events.count("record_stopped") == 1
+    json.loads((tmp_path / "trace.json").read_text())
     assert all(file.stat().st_size <= 20_000 for file in tmp_path.rglob("*") if file.is_file())
 
 

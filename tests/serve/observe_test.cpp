@@ -3,10 +3,12 @@
 #include <arpa/inet.h>
 #include <fcntl.h>
 #include <pthread.h>
+#include <sys/resource.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
 #include <array>
+#include <csignal>
 #include <filesystem>
 #include <fstream>
 #include <nlohmann/json.hpp>
@@ -323,6 +325,33 @@ TEST_CASE("a trace ends at its limit, is valid JSON then too, and is not written
   const auto linked = Trace::open(folder / "link.json");
   REQUIRE_FALSE(linked);
   CHECK(linked.error().found == "a symbolic link");
+}
+
+TEST_CASE("a trace of a disk that is full is valid JSON wherever it ended, and one that cannot begin is refused") {
+  Folder folder;
+  struct rlimit before = {};
+  REQUIRE(::getrlimit(RLIMIT_FSIZE, &before) == 0);
+  const auto handler = std::signal(SIGXFSZ, SIG_IGN);
+  const auto limit_files = [&](rlim_t size) {
+    const struct rlimit limit = {size, before.rlim_max};
+    REQUIRE(::setrlimit(RLIMIT_FSIZE, &limit) == 0);
+  };
+  Sample sample;
+  for (rlim_t size = 500; size < 3000; size += 37) {
+    CAPTURE(size);
+    limit_files(size);
+    {
+      auto trace = Trace::open(folder / "out.json");
+      REQUIRE(trace.ok());
+      for (int i = 0; i < 10; ++i) (*trace)->answered(sample.answered(false));
+    }
+    CHECK(std::filesystem::file_size(folder / "out.json") <= size);
+    CHECK(nlohmann::json::accept(content(folder / "out.json")));
+  }
+  limit_files(100);
+  CHECK(Trace::open(folder / "out.json").error().code == Code::io);
+  limit_files(before.rlim_cur);
+  std::signal(SIGXFSZ, handler);
 }
 
 TEST_CASE("a trace is valid JSON, and its stages end before their act does") {
