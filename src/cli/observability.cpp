@@ -161,6 +161,10 @@ void Observability::loaded(const std::string& name, const Engine& engine) {
               {"memory_mb", static_cast<double>(engine.memory().total()) / 1e6}});
 }
 
+void Observability::without_keys(const char* option, const std::string& address, bool has_token) {
+  log_.event(Level::warn, "without_keys", {{"option", option}, {"address", address}, {"token", has_token}});
+}
+
 void Observability::unloaded(const std::string& name) {
   if (metrics_) metrics_->forget(name);
   log_.event(Level::info, "unloaded", {{"policy", name}});

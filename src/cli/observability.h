@@ -45,6 +45,8 @@ class Observability {
   /// A policy is loaded that answers under this name; all of them are warm, after so many milliseconds.
   void loaded(const std::string& name, const Engine& engine);
   void ready(double warm_up_ms);
+  /// A protocol lets clients in without keys while the server's own asks for them.
+  void without_keys(const char* option, const std::string& address, bool has_token);
   /// A policy answers no more.
   void unloaded(const std::string& name);
   /// How the server ended. The log says so.

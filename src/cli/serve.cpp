@@ -40,9 +40,12 @@ struct ServeOptions {
   ObservabilityOptions observability;
 };
 
+constexpr std::chrono::milliseconds kLoadPatience(500);  // with an order to load, at the end
+
 serve::Server* stopped_by_signals = nullptr;
 
-/// The first SIGTERM or SIGINT lets the server finish; the next one, whichever of the two, ends the process.
+/// The first SIGTERM, SIGINT or SIGHUP lets the server finish; the next one, whichever it is, ends the process. A
+/// hangup that whoever started the program ignores, as nohup does, stays ignored.
 void stop_on_signals(serve::Server& server) {
   stopped_by_signals = &server;
   struct sigaction action = {};
@@ -55,6 +58,9 @@ void stop_on_signals(serve::Server& server) {
   };
   sigaction(SIGTERM, &action, nullptr);
   sigaction(SIGINT, &action, nullptr);
+  struct sigaction hangup = {};
+  sigaction(SIGHUP, nullptr, &hangup);
+  if (hangup.sa_handler != SIG_IGN) sigaction(SIGHUP, &action, nullptr);
 }
 
 /// As a shell reads it back: words as they are, anything else in quotes.
@@ -203,13 +209,30 @@ Result<std::map<std::string, std::string>> named_bundles(const std::vector<std::
   return bundles;
 }
 
+/// Ends the process with success, since a bundle that is being loaded cannot be told to stop. Log, trace and recordings
+/// are closed first.
+[[noreturn]] void end_while_loading(std::unique_ptr<Observability>& observability) {
+  observability.reset();
+  std::_Exit(0);
+}
+
+/// Tells of doors that let everybody in while the server's own protocol has keys.
+void warn_of_doors_without_keys(const serve::ServerOptions& server, Observability& observability) {
+  if (server.curve_secret.empty()) return;
+  for (const auto& [option, address] : {std::pair{"--openpi", &server.openpi}, std::pair{"--gr00t", &server.gr00t},
+                                        std::pair{"--lerobot", &server.lerobot}}) {
+    const bool has_token = !server.api_token.empty() && address != &server.lerobot;
+    if (!address->empty()) observability.without_keys(option, *address, has_token);
+  }
+}
+
 /// `ready`: whether it came as far as that.
 Status serve(ServeOptions& options, bool& ready) {
   VLA_CHECK(check_single(options));
   VLA_TRY(const auto bundles, named_bundles(options.bundles));
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
-  VLA_TRY(const std::unique_ptr<Observability> observability,
+  VLA_TRY(std::unique_ptr<Observability> observability,
           Observability::start(options.observability, *server, options.server.insecure));
   std::unique_ptr<serve::SeenSizes> sizes;
   if (!options.sizes.empty()) {
@@ -221,6 +244,7 @@ Status serve(ServeOptions& options, bool& ready) {
     return serve::warm_up(engine, sizes ? sizes->of(engine) : std::vector<ActShape>());
   };
   server->keep_sizes(sizes.get());
+  warn_of_doors_without_keys(options.server, *observability);
   std::unique_ptr<serve::Control> control;
   if (!options.control.empty()) {
     const auto load = [&options, &warm_up](const std::string& bundle) -> Result<serve::LoadedPolicy> {
@@ -254,6 +278,7 @@ Status serve(ServeOptions& options, bool& ready) {
   ready = true;
   const Status status = server->run(observability->observers());
   observability->ended(status);
+  if (control && !control->stop(kLoadPatience) && status) end_while_loading(observability);
   return status;
 }
 

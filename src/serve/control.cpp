@@ -14,7 +14,9 @@
 #include <algorithm>
 #include <cerrno>
 #include <cstring>
+#include <list>
 #include <nlohmann/json.hpp>
+#include <utility>
 
 #include "base/out_of_memory.h"
 #include "base/thread.h"
@@ -27,8 +29,10 @@ namespace {
 using nlohmann::ordered_json;
 
 constexpr std::size_t kMaxLine = 64 << 10;
-constexpr int kPatienceMs = 5000;  // for an order, once a client is connected
-constexpr int kLoadNice = 10;      // loading gives way to the acts of the policies that answer
+constexpr std::size_t kMaxClients = 16;                    // whose orders are on their way
+constexpr auto kPatience = std::chrono::seconds(5);        // from a connection to the end of its order
+constexpr timeval kReading = {.tv_sec = 2, .tv_usec = 0};  // for a client to take its answer
+constexpr int kLoadNice = 10;                              // loading gives way to the acts of the policies that answer
 
 Result<sockaddr_un> address_of(const std::string& path) {
   sockaddr_un address = {};
@@ -41,18 +45,13 @@ Result<sockaddr_un> address_of(const std::string& path) {
 
 Error failed(const std::string& path, const char* what) { return {Code::io, path, what, std::strerror(errno)}; }
 
-/// A line without its end; what came before the peer fell silent where there is none.
-std::string read_line(int socket, int patience_ms) {
-  std::string line;
-  while (line.size() < kMaxLine && line.find('\n') == std::string::npos) {
-    pollfd wait = {socket, POLLIN, 0};
-    char bytes[4096];
-    if (::poll(&wait, 1, patience_ms) <= 0) break;
-    const ssize_t n = ::recv(socket, bytes, sizeof(bytes), 0);
-    if (n <= 0) break;
-    line.append(bytes, static_cast<std::size_t>(n));
-  }
-  return line.substr(0, line.find('\n'));
+/// Appends what has come of a line, up to its end. Whether no more is to be waited for.
+bool read_some(int socket, std::string& line, int flags) {
+  char bytes[4096];
+  const ssize_t n = ::recv(socket, bytes, sizeof(bytes), flags);
+  if (n < 0) return errno != EAGAIN && errno != EINTR;
+  line.append(bytes, static_cast<std::size_t>(n));
+  return n == 0 || line.size() >= kMaxLine || line.find('\n') != std::string::npos;
 }
 
 bool write_line(int socket, std::string line) {
@@ -132,39 +131,72 @@ Status Control::start() {
   return {};
 }
 
+bool Control::stop(std::chrono::milliseconds patience) {
+  const std::uint64_t one = 1;
+  [[maybe_unused]] const auto written = ::write(stopped_, &one, sizeof(one));
+  ::unlink(path_.c_str());
+  return !thread_.joinable() || thread_ended_.wait_for(patience) == std::future_status::ready;
+}
+
 Control::~Control() {
-  if (thread_.joinable()) {
-    const std::uint64_t one = 1;
-    [[maybe_unused]] const auto written = ::write(stopped_, &one, sizeof(one));
-    thread_.join();
-  }
-  if (listener_ >= 0) ::unlink(path_.c_str());
+  if (listener_ >= 0) stop(std::chrono::milliseconds(0));
+  if (thread_.joinable()) thread_.join();
   for (const int descriptor : {listener_, stopped_})
     if (descriptor >= 0) ::close(descriptor);
 }
 
 void Control::run() {
   ::setpriority(PRIO_PROCESS, 0, ::getpriority(PRIO_PROCESS, 0) + kLoadNice);  // of this thread, and those it starts
+  std::list<Client> clients;
   for (;;) {
-    pollfd wait[] = {{listener_, POLLIN, 0}, {stopped_, POLLIN, 0}};
-    if (::poll(wait, 2, -1) < 0 && errno != EINTR) return;
-    if (wait[1].revents != 0) return;
-    const int client = ::accept4(listener_, nullptr, nullptr, SOCK_CLOEXEC);
-    if (client < 0) continue;
-    answer(client);
-    ::close(client);
+    std::vector<pollfd> wait = {{stopped_, POLLIN, 0}, {listener_, POLLIN, 0}};
+    for (const Client& client : clients) wait.push_back({client.socket, POLLIN, 0});
+    if (::poll(wait.data(), wait.size(), ms_left(clients)) < 0 && errno != EINTR) break;
+    if (wait[0].revents != 0) break;
+    std::size_t i = 2;
+    for (auto client = clients.begin(); client != clients.end(); ++i) {
+      const bool is_whole = wait[i].revents != 0 && read_some(client->socket, client->line, MSG_DONTWAIT);
+      if (is_whole || Clock::now() >= client->until) answer(*client);
+      client = client->socket < 0 ? clients.erase(client) : std::next(client);
+    }
+    if (wait[1].revents != 0) accept(clients);
   }
+  for (const Client& client : clients) ::close(client.socket);
+  ended_.set_value();
 }
 
-/// An exception from a library fails this order, not the server.
-void Control::answer(int client) try {
-  if (!may_order(client)) return;
-  const ordered_json given = ordered_json::parse(read_line(client, kPatienceMs), nullptr, false);
+/// Until the oldest client has had its time.
+int Control::ms_left(const std::list<Client>& clients) {
+  if (clients.empty()) return -1;
+  const auto left = std::chrono::ceil<std::chrono::milliseconds>(clients.front().until - Clock::now());
+  return static_cast<int>(std::max<std::int64_t>(left.count(), 0));
+}
+
+void Control::accept(std::list<Client>& clients) {
+  const int socket = ::accept4(listener_, nullptr, nullptr, SOCK_CLOEXEC);
+  if (socket < 0) {
+    std::this_thread::sleep_for(std::chrono::milliseconds(100));  // without descriptors it would come back at once
+    return;
+  }
+  ::setsockopt(socket, SOL_SOCKET, SO_SNDTIMEO, &kReading, sizeof(kReading));
+  clients.push_back({socket, Clock::now() + kPatience});
+  if (!may_order(socket))
+    ::close(socket), clients.pop_back();
+  else if (clients.size() > kMaxClients)
+    answer(clients.front()), clients.pop_front();
+}
+
+/// Answers what came of its order. An exception from a library fails this order, not the server.
+void Control::answer(Client& client) try {
+  const std::unique_ptr<int, void (*)(int*)> closed(&client.socket,
+                                                    [](int* open) { ::close(std::exchange(*open, -1)); });
+  const std::string line = client.line.substr(0, client.line.find('\n'));
+  const ordered_json given = ordered_json::parse(line, nullptr, false);
   try {
     const Result<ordered_json> reply = obey(given);
-    write_json(client, reply ? *reply : refused(reply.error()));
+    write_json(client.socket, reply ? *reply : refused(reply.error()));
   } catch (const std::bad_alloc&) {
-    write_json(client, refused(out_of_memory("order")));
+    write_json(client.socket, refused(out_of_memory("order")));
   }
 } catch (const std::exception&) {  // not even for the refusal
 }
@@ -208,7 +240,8 @@ Result<ordered_json> order(const std::string& path, const ordered_json& given) {
   if (::connect(socket, reinterpret_cast<const sockaddr*>(&address), sizeof(address)) != 0)
     return failed(path, "the --control of a vla serve that runs");
   if (!write_json(socket, given)) return failed(path, "an order that is taken");
-  const std::string reply = read_line(socket, -1);
+  std::string reply;
+  while (!read_some(socket, reply, 0)) continue;
   ordered_json json = ordered_json::parse(reply, nullptr, false);
   if (!json.is_object())
     return Error{Code::io, path, "an answer", reply.empty() ? "none: another user's server, or it ended" : reply};
