@@ -218,7 +218,13 @@ struct PairProducts : PairPanels<V, Tile> {
     /// c = a * panel, or c += where `sum`.
     template <int kStrideA, int kStrideC>
     VLA_INLINE void add(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c, bool sum) {
-      waiting_[n_waiting_++] = {a, panel, c, kStrideA, kStrideC, static_cast<int>(depth / kDepth), sum};
+      waiting_[n_waiting_++] = {.a = a,
+                                .panel = panel,
+                                .c = c,
+                                .stride_a = kStrideA,
+                                .stride_c = kStrideC,
+                                .n_step = static_cast<int>(depth / kDepth),
+                                .sum = sum};
       n_step_ += static_cast<int>(depth / kDepth);
     }
     /// Steps of everything that was added since the last `finish`.

@@ -141,7 +141,8 @@ class AttentionTile {
         for (; key < segment.n_key; key += kKeys) {
           const int n = static_cast<int>(min(segment.n_key - key, kKeys));
           const Seen seen = job.mask == nullptr ? Seen::all : look(segment.first + key, n);
-          if (seen != Seen::none) return {i_segment, key, n, seen, false, 0, n_row < kPart ? n_row : kPart, 0};
+          if (seen != Seen::none)
+            return {.segment = i_segment, .key = key, .n = n, .seen = seen, .end = n_row < kPart ? n_row : kPart};
         }
       }
       return {};

@@ -77,6 +77,19 @@ class Task {
   KindClock* clock = nullptr;  // which outlives the task
 };
 
+/// A task whose items are calls of run(item, worker).
+template <class Run>
+std::unique_ptr<Task> task_of(std::int64_t n_item, Run run) {
+  struct Calls final : Task {
+    explicit Calls(Run call) : call_(std::move(call)) {}
+    void run(std::int64_t item, Worker& worker) const override { call_(item, worker); }
+    Run call_;
+  };
+  auto task = std::make_unique<Calls>(std::move(run));
+  task->n_item = n_item;
+  return task;
+}
+
 /// Tasks that do not depend on each other: their items are taken side by side.
 struct Phase {
   std::vector<const Task*> tasks;

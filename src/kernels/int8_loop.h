@@ -31,6 +31,13 @@ VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const R
   }
 }
 
+template <class Tile>
+constexpr bool kTakesPairs = requires {
+  Tile::kPairs;
+};
+template <class Tile, class Weights>
+using StripsOf = typename Weights::template Strips<Tile::kColumns / static_cast<int>(Int8Panels::kColumns)>;
+
 /// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows and kBlockKiB (of the block of x,
 /// at most), kStep (of the depth, most), kEven (tiles of equal height), Session (held while a thread works), kSigned
 /// (sums are of the weights themselves, without their offset), kLayout (of a y that is rounded, as LinearStripes says),
@@ -46,20 +53,40 @@ VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const R
 /// latter's bytes for `strips` and no between().
 /// A file that includes this is compiled with -ffp-contract=off: what follows the sums is rounded one by one.
 template <class Tile, class Weights>
+concept Int8Tile = requires {
+  typename Tile::V::Int;
+  typename Tile::Session;
+  typename std::bool_constant<Tile::kEven && Tile::kBeside && Tile::kSigned>;
+  typename std::integral_constant<RoundedLayout, Tile::kLayout>;
+  requires Tile::kRows >
+  0 && Tile::kBlockRows > 0 && Tile::kBlockKiB > 0;
+  requires Tile::kColumns % Int8Panels::kColumns == 0 && Tile::kStep % kQuantizedUnit == 0;
+}
+&&requires(const std::byte* x, std::int64_t n, const StripsOf<Tile, Weights>& strips, std::byte* to, std::int32_t* sums,
+           void (&between)()) {
+  requires kTakesPairs<Tile> || requires { Tile::multiply(int{}, x, n, strips, n, sums, true, between); };
+  requires !kTakesPairs<Tile> || requires {
+    Tile::pair(x, x, n, to);
+    Tile::expand(strips, n, to);
+    Tile::multiply(int{}, x, n, to, n, sums, true);
+  };
+};
+
+template <class Tile, class Weights>
+requires Int8Tile<Tile, Weights>
 class Int8Loop {
-  static constexpr bool kPairs = requires { Tile::kPairs; };
+  static constexpr bool kPairs = kTakesPairs<Tile>;
   using V = typename Tile::V;
   using Stripes = LinearStripes<Tile, Tile::kLayout>;
   using Finish = typename Stripes::Finish;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
   static constexpr int kStrips = Tile::kColumns / static_cast<int>(Int8Panels::kColumns);
-  using Numbers = typename Weights::template Strips<kStrips>;
+  using Numbers = StripsOf<Tile, Weights>;
   static constexpr std::int64_t kFewRows = 32;   // which the tile unpacks weights for
   static constexpr std::int64_t kMinItems = 16;  // for each thread, where there are so many
   static constexpr bool kPacked = !std::is_same_v<Weights, BytePanels>;
   static constexpr bool kFirstExpands = requires { Tile::kFirstExpands; };
   static constexpr std::int32_t kOffset = Tile::kSigned ? 0 : Weights::kOffset;
-  static_assert(kColumns % Int8Panels::kColumns == 0 && Tile::kStep % kQuantizedUnit == 0);
 
   struct Scratch {
     // In pairs: which rows of x the block holds. Items of one block follow each other, so that a worker copies it once.
@@ -192,7 +219,13 @@ class Int8Loop {
         else if constexpr (kPacked)
           multiply(ExpandedStrips<kStrips, Numbers>{scratch_->panel, numbers});
         if (k + d < depth) continue;
-        summed_ = {this, &part, s, gate, r, n_row, 0, Finish(job_, s, scratch_->scaled, r, n_row)};
+        summed_ = {.loop = this,
+                   .part = &part,
+                   .s = s,
+                   .gate = gate,
+                   .r = r,
+                   .n_row = n_row,
+                   .to_y = Finish(job_, s, scratch_->scaled, r, n_row)};
         if constexpr (!Tile::kBeside) summed_.finish();
       }
     }

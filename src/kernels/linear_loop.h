@@ -31,6 +31,22 @@ struct Prefetch {
 ///   multiply(type, n_row, x, panel, depth, c, add, ahead)
 ///     c [kColumns] x n_row <= kRows, += where `add`; prefetches ahead
 template <class Tile>
+concept LinearTile = requires(const float* from, std::int64_t n, typename Tile::X* to, const typename Tile::X* x,
+                              const std::byte* panel, float* c, const Prefetch& ahead) {
+  typename Tile::V::Float;
+  typename std::bool_constant<Tile::kEven>;
+  requires Tile::kMaxDepth % kPanelDepth == 0 && Tile::kXStride > 0;
+  requires Tile::kStep % kPanelDepth == 0 && Tile::kBlockRows % Tile::kRows == 0;
+  Tile::copy(from, n, to);
+  Tile::multiply(DType::f32, int{Tile::kRows}, x, panel, n, c, true, ahead);
+}
+&&(!Tile::kRounds ||
+   requires(const typename Tile::X* from, std::int64_t n, typename Tile::X* to, typename Tile::V::Float vector) {
+     Tile::copy(from, n, to);
+     Tile::store_rounded(to, vector, n);
+   });
+
+template <LinearTile Tile>
 class LinearLoop {
   using V = typename Tile::V;
   using X = typename Tile::X;
@@ -40,8 +56,6 @@ class LinearLoop {
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
   static constexpr std::int64_t kGateColumns = 16 * kColumns;  // of a job whose depth takes more than one block
   static constexpr std::int64_t kMinItems = 16;                // for each thread, where there are so many
-  static_assert(Tile::kMaxDepth % kPanelDepth == 0);
-  static_assert(Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0);
 
   struct Scratch {
     // Which rows of x the block holds, and from which depth on: items of one block follow each other, so that a worker

@@ -14,8 +14,8 @@ namespace vla::kernels {
 /// One panel's columns of a part by the rows of a block of x, over a part of the depth.
 struct Stripe {
   int part;
-  std::int64_t column, n_column, row, n_row, k, depth;
-  float* gates;  // [kColumns] x n_row
+  std::int64_t column, n_column, row = 0, n_row = 0, k = 0, depth = 0;
+  float* gates = nullptr;  // [kColumns] x n_row
 };
 
 /// `Tile` as the loop describes it. It has a type of its own in each file, so that the linker cannot merge what was
@@ -38,7 +38,7 @@ struct LinearStripes {
     int part = first_part(job);
     for (; panel >= ceil_div(job.part[part].d_out, kColumns); ++part) panel -= ceil_div(job.part[part].d_out, kColumns);
     const std::int64_t column = panel * kColumns;
-    return {part, column, min(kColumns, job.part[part].d_out - column), 0, 0, 0, 0, nullptr};
+    return {.part = part, .column = column, .n_column = min(kColumns, job.part[part].d_out - column)};
   }
 
   /// A part's panel at a column, from depth k on.

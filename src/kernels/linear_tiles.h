@@ -19,6 +19,15 @@ namespace vla::kernels {
 ///   multiply(half, x, panel, n_square, c, add, between)
 ///     a square c of sums, += where `add`, or its first 16 rows; calls between() n_square times
 template <class Tile>
+concept SquareTile = requires(const float* from, std::int64_t n, std::uint16_t* to, typename Tile::V::Float vector,
+                              const std::uint16_t* x, const std::byte* panel, float* c, void (&between)()) {
+  typename Tile::Session;
+  Tile::copy(from, n, to);
+  Tile::store_rounded(to, vector, n);
+  Tile::multiply(true, x, panel, n, c, true, between);
+};
+
+template <SquareTile Tile>
 class TileLoop {
   using V = typename Tile::V;
   using X = std::uint16_t;

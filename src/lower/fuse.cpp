@@ -1,11 +1,10 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
-#include <iterator>
 #include <map>
 #include <tuple>
 
-#include "lower/lowering.h"
+#include "lower/ops.h"
 
 namespace vla::lower {
 namespace {
@@ -20,15 +19,16 @@ class Fuser {
     for (const Node& node : l.graph.nodes())
       if (l.needed[at(&node)] && !l.fused[at(&node)]) visit(node);
     join_products();
-    fuse_norms();
-    fuse_windows();
+    fuse_readings();
     // A norm or a window that its readers compute is no operation.
     std::erase_if(ops_, [&](const FusedOp& op) {
       const auto* row = std::get_if<RowOp>(&op.op);
       const auto* window = std::get_if<WindowOp>(&op.op);
       return (row != nullptr && l.fused[at(row->node)]) || (window != nullptr && l.fused[at(window->node)]);
     });
-    for (FusedOp& op : ops_) note_operands(op);
+    for (FusedOp& op : ops_)
+      for (const Operand& read : std::visit([](auto& what) { return what.operands(); }, op.op))
+        if (read.id != kNone) op.reads.push_back(read.id);
     std::stable_sort(ops_.begin(), ops_.end(), [](const FusedOp& a, const FusedOp& b) { return a.order < b.order; });
     return std::move(ops_);
   }
@@ -51,93 +51,9 @@ class Fuser {
 
   void visit(const Node& node, const op::Linear&) { visit_linear(node); }
   void visit(const Node& node, const op::Attention&) { visit_attention(node); }
-  void visit(const Node& node, const op::Concat& op) { add(concat(node, op), node); }
-  void visit(const Node& node, const op::PixelShuffle& op) { add(pixel_shuffle(node, op), node); }
-  void visit(const Node& node, const op::Embedding&) { add(LookupOp{&node, operand(node, 0)}, node); }
-  void visit(const Node& node, const op::Gather&) { add(LookupOp{&node, operand(node, 1), operand(node, 0)}, node); }
-  void visit(const Node& node, const op::Patches&) { add(PatchesOp{&node, operand(node, 0)}, node); }
-  void visit(const Node& node, const op::Unfold& op) { add(WindowOp{&node, op.window, false, operand(node, 0)}, node); }
-  void visit(const Node& node, const op::MaxPool& op) { add(WindowOp{&node, op.window, true, operand(node, 0)}, node); }
-
-  void visit(const Node& node, const op::Depthwise& op) {
-    add(WindowOp{&node, op.window, false, operand(node, 0), operand(node, 1), operand(node, 2)}, node);
-  }
-  void visit(const Node& node, const op::ChannelAttention&) {
-    add(ChannelOp{&node, operand(node, 0), operand(node, 1), operand(node, 2)}, node);
-  }
-
-  void visit(const Node& node, const op::Norm& op) { add_rows(node, op); }
-  void visit(const Node& node, const op::Rope& op) { add_rows(node, op); }
-  void visit(const Node& node, const op::Activate& op) { add_rows(node, op); }
-  void visit(const Node& node, const op::Add& op) { add_rows(node, op); }
-  void visit(const Node& node, const op::Multiply& op) { add_rows(node, op); }
-  void visit(const Node& node, const op::Scale& op) { add_rows(node, op); }
-  void add_rows(const Node& node, decltype(RowOp::what) what) {
-    add(RowOp{&node, what, operand(node, 0), operand(node, 1), operand(node, 2)}, node);
-  }
-
-  // Copies where a view would do but must not be one.
-  void visit(const Node& node, const op::Slice& op) {
-    const ValueId x = operand(node, 0);
-    copy(node, [&](CopyOp::Part& part) {
-      part.from_offset = op.first * l.value(x).stride[static_cast<std::size_t>(op.dim)];
-    });
-  }
-  void visit(const Node& node, const op::Repeat&) {
-    const Shape& from = node.in[0].shape();
-    copy(node, [&](CopyOp::Part& part) {
-      for (std::size_t i = 0; i < 4; ++i)
-        if (from[i] == 1) part.from_stride[i] = 0;
-    });
-  }
-  void visit(const Node& node, const op::Reshape&) {
-    const Shape& from = node.in[0].shape();
-    copy(node, [&](CopyOp::Part& part) { part.shape = from, part.to_stride = contiguous_strides(from); });
-  }
-  template <class Change>
-  void copy(const Node& node, const Change& change) {
-    if (l.value(node.id).base != node.id) return;  // a view
-    const ValueId x = operand(node, 0);
-    CopyOp::Part part = {x, node.shape, l.value(x).stride, contiguous_strides(node.shape), 0};
-    change(part);
-    add(CopyOp{{part}}, node);
-  }
-
-  static ValueId operand(const Node& node, std::size_t i) { return i < node.in.size() ? node.in[i].node()->id : kNone; }
-
-  CopyOp concat(const Node& node, const op::Concat& concat) const {
-    CopyOp op;
-    const auto dim = static_cast<std::size_t>(concat.dim);
-    const Shape to = contiguous_strides(node.shape);
-    std::int64_t offset = 0;
-    for (Tensor part : node.in) {
-      const Value& from = l.value(part.node()->id);
-      op.parts.push_back({part.node()->id, from.shape, from.stride, to, offset});
-      offset += from.shape[dim] * to[dim];
-    }
-    return op;
-  }
-
-  /// Patch (factor R + r, factor C + c) becomes part (r, c) of token (R, C): one copy for each
-  /// part.
-  CopyOp pixel_shuffle(const Node& node, const op::PixelShuffle& shuffle) const {
-    const auto [n_column, factor] = shuffle;
-    const Value& x = l.value(node.in[0].node()->id);
-    const std::int64_t d = x.shape[0], row = x.stride[1], n_row = x.shape[1] / n_column;
-    CopyOp op;
-    for (int r = 0; r < factor; ++r)
-      for (int c = 0; c < factor; ++c) {
-        CopyOp::Part part;
-        part.from = node.in[0].node()->id;
-        part.shape = {d, n_column / factor, n_row / factor, x.shape[2]};
-        part.from_stride = {x.stride[0], factor * row, factor * n_column * row, x.stride[2]};
-        part.to_stride = {1, node.shape[0], node.shape[0] * (n_column / factor), node.shape[0] * node.shape[1]};
-        part.to_offset = (r * factor + c) * d;
-        // The part begins at patch (r, c).
-        part.from_offset = (r * n_column + c) * row;
-        op.parts.push_back(part);
-      }
-    return op;
+  template <class Op>
+  void visit(const Node& node, const Op& op) {
+    if (l.value(node.id).base == node.id) add(lowered(l, node, op), node);  // else it is a view
   }
 
   /// The only node that reads this one, if there is exactly one and no tap, unless it is part of something already.
@@ -147,8 +63,7 @@ class Fuser {
     return l.fused[at(reader)] ? nullptr : reader;
   }
 
-  static const Param& weight(const Node& linear) { return *linear.as<op::Linear>()->weight; }
-  const void* multiplier(const Node& linear) const { return l.target.multiplier(weight(linear)); }
+  Multiplier multiplier(const Node& linear) const { return l.target.multiplier(*linear.as<op::Linear>()->weight); }
 
   void visit_linear(const Node& linear) {
     LinearOp op;
@@ -166,7 +81,7 @@ class Fuser {
         const Tensor other = next->in[next->in[0].node() == result ? 1 : 0];
         if (other.shape() == result->shape) op.residual = other.node()->id, result = take(next);
       }
-      if (op.residual != kNone && l.target.takes_relu(weight(linear)))
+      if (op.residual != kNone && multiplier(linear).takes_relu)
         if (const Node* next = only_reader(*result); next != nullptr && is_relu(*next))
           op.ends_in_relu = true, result = take(next);
     }
@@ -204,7 +119,7 @@ class Fuser {
       if (gate->as<op::Linear>() == nullptr || only_reader(*gate) != activate) return nullptr;
     }
     if (up->as<op::Linear>() == nullptr || only_reader(*up) != product || up->in[0] != gate->in[0] ||
-        multiplier(*up) != multiplier(*gate) || up->shape != gate->shape)
+        multiplier(*up).kernel != multiplier(*gate).kernel || up->shape != gate->shape)
       return nullptr;
     op.linears = {gate, up}, op.gated = true, op.activation = activate->as<op::Activate>()->activation;
     take(gate), take(up), take(activate);
@@ -212,8 +127,8 @@ class Fuser {
   }
 
   /// A norm or a rotation of heads that only this attention reads is done while it copies the rows.
-  Prepared prepared(Tensor x) {
-    Prepared result = {x.node()->id};
+  HeadRows prepared(Tensor x) {
+    HeadRows result = {x.node()->id};
     const auto is_only = [&](const Node* node) { return !node->tapped && l.readers[at(node)].size() == 1; };
     const Node* node = x.node();
     if (node->as<op::Rope>() != nullptr && is_only(node)) {
@@ -230,7 +145,7 @@ class Fuser {
   }
 
   /// Rows of norms and rotations were visited before the attention that takes them.
-  void drop(const Prepared& rows) {
+  void drop(const HeadRows& rows) {
     for (const Node* node : {rows.norm, rows.rope})
       if (node != nullptr) l.fused[at(node)] = true;
   }
@@ -253,7 +168,7 @@ class Fuser {
     const Node* node = x.node();
     while (node->as<op::Linear>() == nullptr && !node->in.empty()) node = node->in[0].node();
     if (node->as<op::Linear>() == nullptr) return false;
-    const DType type = l.target.encoding(weight(*node)).type;
+    const DType type = multiplier(*node).encoding->type;
     return type == DType::f32 || type == DType::f16;
   }
 
@@ -262,7 +177,7 @@ class Fuser {
     const std::size_t first = has_mask ? 2 : 1;
     std::int64_t n_key = 0;
     for (std::size_t i = first; i < node.in.size(); i += 2) n_key += node.in[i].dim(2);
-    const bool rounds = n_key >= l.target.min_rounded_keys() && !comes_from_floats(node.in[0]);
+    const bool rounds = n_key >= l.target.min_rounded_keys && !comes_from_floats(node.in[0]);
     AttentionOp op = {&node, prepared(node.in[0]), rounds};
     drop(op.q);
     if (has_mask) op.mask = node.in[1].node()->id;
@@ -281,8 +196,8 @@ class Fuser {
       if (linear == nullptr || linear->gated || linear->activation != Activation::none || linear->factor != kNone ||
           linear->residual != kNone)
         continue;
-      FusedOp*& first = open[{linear->x, multiplier(*linear->linears[0])}];
-      if (first == nullptr || first->writes.size() == l.target.max_products()) {
+      FusedOp*& first = open[{linear->x, multiplier(*linear->linears[0]).kernel}];
+      if (first == nullptr || first->writes.size() == l.target.max_products) {
         first = &op;
         continue;
       }
@@ -293,64 +208,25 @@ class Fuser {
     std::erase_if(ops_, [](const FusedOp& op) { return op.writes.empty(); });
   }
 
-  /// A norm that products alone read is computed by them, row by row as they copy x.
-  void fuse_norms() {
+  /// Fuses a norm or a window into the products that alone read it: they compute it as they copy x, row by row or
+  /// place by place.
+  void fuse_readings() {
     for (FusedOp& op : ops_) {
       auto* linear = std::get_if<LinearOp>(&op.op);
-      if (linear == nullptr) continue;
-      const Node* norm = l.node(linear->x);
-      if (norm == nullptr || norm->as<op::Norm>() == nullptr || norm->tapped) continue;
-      const bool takes = std::all_of(l.readers[at(norm)].begin(), l.readers[at(norm)].end(), [&](const Node* reader) {
-        return reader->as<op::Linear>() != nullptr && norm->shape[0] <= l.target.max_norm(weight(*reader));
-      });
-      const Value& x = l.value(norm->in[0].node()->id);
-      if (!takes || row_stride(x) < 0) continue;
-      linear->norm = norm, linear->x = operand(*norm, 0);
-      linear->norm_weight = operand(*norm, 1), linear->norm_bias = operand(*norm, 2);
-      l.fused[at(norm)] = true;
+      const Node* read = linear != nullptr ? l.node(linear->x) : nullptr;
+      if (read == nullptr || read->tapped) continue;
+      const bool is_norm = read->as<op::Norm>() != nullptr && row_stride(l.value(operand(*read, 0))) >= 0;
+      const bool is_window = read->as<op::Unfold>() != nullptr;
+      const auto takes = [&](const Node* reader) {
+        if (reader->as<op::Linear>() == nullptr) return false;
+        const Multiplier by = multiplier(*reader);
+        return is_norm ? read->shape[0] <= by.max_norm : by.takes_windows;
+      };
+      if ((!is_norm && !is_window) || !std::ranges::all_of(l.readers[at(read)], takes)) continue;
+      (is_norm ? linear->norm : linear->unfold) = take(read), linear->x = operand(*read, 0);
+      if (is_norm) linear->norm_weight = operand(*read, 1), linear->norm_bias = operand(*read, 2);
     }
   }
-
-  /// Fuses Unfold into the products that read it: they take what a window covers place by place as they copy x.
-  void fuse_windows() {
-    for (FusedOp& op : ops_) {
-      auto* linear = std::get_if<LinearOp>(&op.op);
-      if (linear == nullptr || linear->norm != nullptr) continue;
-      const Node* unfold = l.node(linear->x);
-      if (unfold == nullptr || unfold->as<op::Unfold>() == nullptr || unfold->tapped) continue;
-      const bool takes =
-          std::all_of(l.readers[at(unfold)].begin(), l.readers[at(unfold)].end(), [&](const Node* reader) {
-            return reader->as<op::Linear>() != nullptr && l.target.takes_windows(weight(*reader));
-          });
-      if (!takes) continue;
-      linear->unfold = unfold, linear->x = operand(*unfold, 0);
-      l.fused[at(unfold)] = true;
-    }
-  }
-
-  static void note_operands(FusedOp& op) {
-    const std::vector<ValueId> all = std::visit([](const auto& what) { return operands(what); }, op.op);
-    std::copy_if(all.begin(), all.end(), std::back_inserter(op.reads), [](ValueId id) { return id != kNone; });
-  }
-  static std::vector<ValueId> operands(const LinearOp& op) {
-    return {op.x, op.factor, op.residual, op.norm_weight, op.norm_bias};
-  }
-  static std::vector<ValueId> operands(const PackOp& op) { return {op.k.x, op.k.weight, op.k.table, op.v}; }
-  static std::vector<ValueId> operands(const AttentionOp& op) {
-    std::vector<ValueId> all = op.packed;
-    all.insert(all.end(), {op.q.x, op.q.weight, op.q.table, op.mask});
-    return all;
-  }
-  static std::vector<ValueId> operands(const CopyOp& op) {
-    std::vector<ValueId> all;
-    for (const CopyOp::Part& part : op.parts) all.push_back(part.from);
-    return all;
-  }
-  static std::vector<ValueId> operands(const RowOp& op) { return {op.x, op.w, op.b}; }
-  static std::vector<ValueId> operands(const LookupOp& op) { return {op.table, op.ids}; }
-  static std::vector<ValueId> operands(const PatchesOp& op) { return {op.images}; }
-  static std::vector<ValueId> operands(const WindowOp& op) { return {op.x, op.weight, op.bias}; }
-  static std::vector<ValueId> operands(const ChannelOp& op) { return {op.q, op.k, op.v}; }
 
   Lowering& l;
   std::vector<FusedOp> ops_;

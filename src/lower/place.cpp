@@ -23,16 +23,16 @@ std::vector<Lifetime> find_lifetimes(const Lowering& l, const std::vector<Step*>
     for (const ValueId id : step->reads) at(id).last = std::max(at(id).last, step->phase);
   for (const Node& node : l.graph.nodes())
     if (node.tapped)
-      at(node.id).last = std::max(at(node.id).last, l.target.keeps_taps() ? l.n_phase : l.there_in(node.id));
+      at(node.id).last = std::max(at(node.id).last, l.target.keeps_taps ? l.n_phase : l.there_in(node.id));
   return lifetimes;
 }
 
 }  // namespace
 
 /// Values one after the other, largest first, each at the lowest place that no other value takes while it lives.
+/// Constants lie behind what is kept.
 void place(Lowering& l, const std::vector<Step*>& steps) {
   const std::vector<Lifetime> lifetimes = find_lifetimes(l, steps);
-  const std::size_t alignment = l.target.alignment();
   std::vector<std::size_t> order(l.values.size());
   std::iota(order.begin(), order.end(), std::size_t{0});
   std::stable_sort(order.begin(), order.end(),
@@ -47,7 +47,7 @@ void place(Lowering& l, const std::vector<Step*>& steps) {
     const Lifetime& lifetime = lifetimes[i];
     if (value.placement != Value::Placement::arena || value.base != static_cast<ValueId>(i) || lifetime.last < 0)
       continue;
-    const std::size_t size = (value.size + alignment - 1) / alignment * alignment;
+    const std::size_t size = l.target.aligned(value.size);
     if (lifetime.first < l.n_prepare && lifetime.last >= l.n_prepare) {  // made by prepare, for every run
       value.placement = Value::Placement::kept;
       value.begin = l.kept_size;
@@ -64,6 +64,9 @@ void place(Lowering& l, const std::vector<Step*>& steps) {
                  now);
     l.arena_size = std::max(l.arena_size, now.end);
   }
+  for (Value& value : l.values)
+    if (value.placement == Value::Placement::constant)
+      value.begin = l.kept_size, l.kept_size += l.target.aligned(value.size);
 }
 
 }  // namespace vla::lower

@@ -44,6 +44,11 @@ std::int64_t row_stride(const Value& value) {
   return row;
 }
 
+const void* constant_of(const Value& value) {
+  return std::visit([](const auto& elements) -> const void* { return elements.data(); },
+                    value.node->as<op::Constant>()->values);
+}
+
 namespace {
 
 /// Strides of the same elements in another shape, where that takes no copy: every dimension of the one must be cut from
@@ -84,7 +89,7 @@ Value view(const Node& node, const Value& of, const Shape& stride, std::int64_t 
   return value;
 }
 
-/// A view where the operation computes nothing, else a value of its own: one function for each operation.
+/// A view where the operation computes nothing, else a value of its own.
 struct MakeValue {
   const Lowering& l;
   const Node& node;
@@ -117,23 +122,11 @@ struct MakeValue {
     return must_copy() || !stride ? own(node) : view(node, x(), *stride, 0);
   }
 
-  Value operator()(const op::Linear&) const { return own(node); }
-  Value operator()(const op::Embedding&) const { return own(node); }
-  Value operator()(const op::Gather&) const { return own(node); }
-  Value operator()(const op::Norm&) const { return own(node); }
-  Value operator()(const op::Rope&) const { return own(node); }
-  Value operator()(const op::Attention&) const { return own(node); }
-  Value operator()(const op::Activate&) const { return own(node); }
-  Value operator()(const op::Add&) const { return own(node); }
-  Value operator()(const op::Multiply&) const { return own(node); }
-  Value operator()(const op::Scale&) const { return own(node); }
-  Value operator()(const op::Concat&) const { return own(node); }
-  Value operator()(const op::Patches&) const { return own(node); }
-  Value operator()(const op::PixelShuffle&) const { return own(node); }
-  Value operator()(const op::Unfold&) const { return own(node); }
-  Value operator()(const op::MaxPool&) const { return own(node); }
-  Value operator()(const op::Depthwise&) const { return own(node); }
-  Value operator()(const op::ChannelAttention&) const { return own(node); }
+  /// Whatever else there is computes.
+  template <class Computes>
+  Value operator()(const Computes&) const {
+    return own(node);
+  }
 
  private:
   const Value& x() const { return l.value(node.in[0].node()->id); }

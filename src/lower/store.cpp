@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 
-#include "lower/lowering.h"
+#include "lower/ops.h"
 
 namespace vla::lower {
 namespace {
@@ -39,7 +39,7 @@ void store(Lowering& l, std::vector<FusedOp>& ops, const Node& write) {
     return;
   }
   FusedOp& op = ops.emplace_back();
-  op.op = CopyOp{{{from, value.shape, value.stride, contiguous_strides(value.shape), 0}}};
+  op.op = CopyOp{nullptr, {{from, value.shape, value.stride, contiguous_strides(value.shape)}}};
   op.reads = {from}, op.writes = {write.id}, op.order = write.id;
 }
 

@@ -61,7 +61,7 @@ EXTERNAL = [
     (re.compile(r"sodium\.h"), {"zmtp"}),
 ]
 # Files of lower beside the folder of a machine hold for every machine, but for the one that chooses.
-EVERY_MACHINE = re.compile(r"lower/(?!arithmetic)\w+\.(h|cpp)")
+EVERY_MACHINE = re.compile(r"lower/(ops/)?(?!arithmetic)\w+\.(h|cpp)")
 INCLUDE = re.compile(r'^\s*#\s*include\s*(?:"([^"]+)"|<([^>]+)>)', re.M)
 
 

@@ -59,7 +59,8 @@ void choose_blocks(CpuLowering& l) {
     CpuOp& down = *found->second[0];
     const auto* reader = std::get_if<LinearOp>(&down.op);
     if (reader == nullptr || reader->x != inner || l.value(inner).placement != Value::Placement::arena) continue;
-    if (const std::int64_t n_block = n_block_of(l, l.value(inner), kernel_of(l, *reader))) join(l, up, down, n_block);
+    if (const std::int64_t n_block = n_block_of(l, l.value(inner), kernel_of(l, *reader->linears[0])))
+      join(l, up, down, n_block);
   }
   std::erase_if(l.ops, [](const CpuOp& op) { return op.writes.empty(); });
 }

@@ -20,31 +20,9 @@ namespace {
 /// More keys than attention can have: none of it rounds.
 constexpr std::int64_t kNoKeys = std::numeric_limits<std::int64_t>::max();
 
-class CpuTarget final : public Target {
- public:
-  CpuTarget(const CpuWeights& weights, std::int64_t min_rounded_keys, bool keeps_taps)
-      : weights_(weights), min_rounded_keys_(min_rounded_keys), keeps_taps_(keeps_taps) {}
-
-  const void* multiplier(const Param& matrix) const override { return weights_.kernel(&matrix); }
-  std::size_t max_products() const override { return kernels::LinearJob::kMaxPart; }
-  std::int64_t max_norm(const Param& matrix) const override { return weights_.kernel(&matrix)->max_norm; }
-  bool takes_windows(const Param& matrix) const override { return weights_.kernel(&matrix)->takes_windows; }
-  bool takes_relu(const Param& matrix) const override { return takes_windows(matrix); }
-  const Encoding& encoding(const Param& matrix) const override { return weights_.encoding(&matrix); }
-  std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
-  bool keeps_taps() const override { return keeps_taps_; }
-  std::size_t alignment() const override { return kAlignment; }
-
- private:
-  const CpuWeights& weights_;
-  std::int64_t min_rounded_keys_;
-  bool keeps_taps_;
-};
-
-std::vector<Step*> steps(CpuLowering& l) {
-  std::vector<Step*> steps;
-  for (CpuOp& op : l.ops) steps.push_back(&op);
-  return steps;
+Multiplier multiplier_of(const CpuWeights& weights, const Param& matrix) {
+  const kernels::LinearKernel& kernel = *weights.kernel(&matrix);
+  return {&kernel, kernel.max_norm, kernel.takes_windows, kernel.takes_windows, &weights.encoding(&matrix)};
 }
 
 /// Kernels of attention have room for so much.
@@ -105,18 +83,19 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
   if (!graph.problem().empty())
     return Error{Code::internal, "graph", "operands that fit", graph.problem(), "please report this"};
   VLA_CHECK(check_attention(graph));
-  const CpuTarget target(weights_, rounds_to_bf16(arithmetic_.use) ? min_rounded_keys_ : kNoKeys, !options.see_tap);
+  const Target target = {.multiplier = [this](const Param& matrix) { return multiplier_of(weights_, matrix); },
+                         .norm_needs = Needs::unit_rows,
+                         .max_products = kernels::LinearJob::kMaxPart,
+                         .min_rounded_keys = rounds_to_bf16(arithmetic_.use) ? min_rounded_keys_ : kNoKeys,
+                         .keeps_taps = !options.see_tap,
+                         .alignment = kAlignment};
   CpuLowering l = {{.graph = graph, .options = options, .target = target}, weights_, arithmetic_.use, n_thread()};
   start(l);
   std::vector<FusedOp> ops = fuse(l);
   store(l, ops);
   choose_layouts(l, std::move(ops));
   choose_blocks(l);
-  schedule(l, steps(l));
-  place(l, steps(l));
-  std::stable_sort(l.ops.begin(), l.ops.end(), [](const CpuOp& a, const CpuOp& b) {
-    return std::pair(a.phase, a.order) < std::pair(b.phase, b.order);
-  });
+  arrange(l, l.ops);
   if (l.arena_size > arena_.size()) {
     // Programs made before keep the memory that they were given.
     VLA_TRY(arena_, Memory::allocate(l.arena_size, "working memory"));

@@ -4,18 +4,10 @@
 
 #include "kernels/rounded.h"
 #include "lower/cpu/cpu_weights.h"
-#include "lower/lowering.h"
+#include "lower/ops.h"
 
 /// The passes of the CPU: a layout for every value, blocks of rows that stay in a cache, and a task for each operation.
 namespace vla::lower {
-
-/// Rows of x as int8 codes with their scales, for products that take them (kernels/quantized.h).
-struct QuantizeOp {
-  ValueId x;
-  const Node* norm = nullptr;  // x is what this node normalizes
-  ValueId norm_weight = kNone, norm_bias = kNone;
-  const kernels::LinearKernel* kernel;
-};
 
 struct CpuOp;
 /// Two products, of which the second alone reads what the first makes, as in an MLP. A thread takes a block of rows
@@ -23,12 +15,13 @@ struct CpuOp;
 struct BlockedOp {
   std::vector<CpuOp> products;
   std::int64_t n_block;
+
+  std::string text() const { return ""; }  // its products have theirs
+  double flop() const;
 };
 
 struct CpuOp : Step {
-  std::variant<LinearOp, QuantizeOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp, ChannelOp,
-               BlockedOp>
-      op;
+  AnyOp<PackOp, BlockedOp> op;
 };
 
 struct CpuLowering : Lowering {
@@ -44,7 +37,7 @@ struct CpuLowering : Lowering {
 
 inline kernels::RoundedLayout rounded(const Value& value) { return static_cast<kernels::RoundedLayout>(value.layout); }
 /// The kernel that multiplies: all matrices of an operation have the same.
-const kernels::LinearKernel& kernel_of(const CpuLowering& l, const LinearOp& op);
+const kernels::LinearKernel& kernel_of(const CpuLowering& l, const Node& linear);
 
 /// Chooses the dtype of values between products, makes codes of what those of codes read, and copies what its reader
 /// needs contiguous.

@@ -31,39 +31,33 @@ Result<std::unique_ptr<Program>> CpuProgram::make(CpuLowering& l, const Memory& 
 }
 
 Status CpuProgram::give_addresses(CpuLowering& l) {
-  std::size_t size = aligned(l.kept_size);
-  for (const Value& value : l.values)
-    if (value.placement == Value::Placement::constant) size += aligned(value.size);
-  VLA_TRY(own_, Memory::allocate(size, "constants"));
-  std::byte* next = own_.data() + aligned(l.kept_size);
+  VLA_TRY(own_, Memory::allocate(l.kept_size, "constants"));
   const auto address = [&](const Value& value) -> std::byte* {
     switch (value.placement) {
       case Value::Placement::arena:
         return arena_.data() + value.begin;
       case Value::Placement::kept:
+      case Value::Placement::constant:
         return own_.data() + value.begin;
       case Value::Placement::slot:
         return static_cast<std::byte*>(value.slot->place);
       case Value::Placement::parameter:
         return const_cast<std::byte*>(l.weights.data(value.node->as<op::Parameter>()->param));
-      case Value::Placement::constant:
-        std::visit([&](const auto& elements) { std::memcpy(next, elements.data(), value.size); },
-                   value.node->as<op::Constant>()->values);
-        return std::exchange(next, next + aligned(value.size));
       case Value::Placement::thread:
         break;
     }
     return nullptr;  // a thread's own
   };
-  for (std::size_t i = 0; i < l.values.size(); ++i)
-    l.data.push_back(l.values[i].base == static_cast<ValueId>(i) ? address(l.values[i]) : nullptr);
+  for (std::size_t i = 0; i < l.values.size(); ++i) {
+    const Value& value = l.values[i];
+    l.data.push_back(value.base == static_cast<ValueId>(i) ? address(value) : nullptr);
+    if (value.placement == Value::Placement::constant) std::memcpy(l.data[i], constant_of(value), value.size);
+  }
   return {};
 }
 
 Status CpuProgram::make_tasks(const CpuLowering& l) {
   std::size_t scratch = 0;
-  for (const CpuOp& op : l.ops) scratch = std::max(scratch, scratch_of(l, op));
-  VLA_CHECK(executor_->reserve(scratch));
   n_prepare_ = static_cast<std::size_t>(l.n_prepare);
   phases_.resize(static_cast<std::size_t>(l.n_phase)), uses_.resize(phases_.size());
   const auto& stages = l.graph.stages();
@@ -73,10 +67,13 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
   std::vector<std::size_t> stage_end(stages.size(), 0);  // the last phase of each, and one
   for (const CpuOp& op : l.ops) {
     const auto phase = static_cast<std::size_t>(op.phase);
-    tasks_.push_back(emit(l, op, uses_[phase]));
-    tasks_.back()->kind = kind_of(op), tasks_.back()->clock = clock_.get();
+    CpuRun run = run_of(l, op);
+    scratch = std::max(scratch, run.scratch);
+    const std::string text = text_of(l, op, run);
+    uses_[phase].insert(uses_[phase].end(), run.matrices.begin(), run.matrices.end());
+    tasks_.push_back(std::move(run.task));
+    tasks_.back()->kind = run.kind, tasks_.back()->clock = clock_.get();
     phases_[phase].tasks.push_back(tasks_.back().get());
-    const std::string text = text_of(l, op);
     text_ += text + "\n";
     const std::size_t stage = stage_of(l, op);
     const Work work = work_of(l, op);
@@ -93,7 +90,7 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
   for (std::size_t i = 0; i < stages.size(); ++i)
     if (stage_end[i] > 0) phases_[stage_end[i] - 1].done = &stages_[i].done;
   host_size_ += text_.size();
-  return {};
+  return executor_->reserve(scratch);
 }
 
 void CpuProgram::make_taps(const CpuLowering& l) {

@@ -15,19 +15,6 @@
 namespace vla::lower {
 namespace {
 
-/// Parts of parameters on their way to memory, an item each.
-struct PackMatrixTask : kernels::Task {
-  const Content* content;
-  std::vector<PackPart> parts;
-  mutable std::vector<Packer> packers;  // of each worker
-  mutable std::atomic<bool> has_failed = false;
-
-  void run(std::int64_t item, kernels::Worker& worker) const override {
-    Packer& packer = packers[static_cast<std::size_t>(worker.index)];
-    if (!packer.run(*content, parts[static_cast<std::size_t>(item)])) has_failed = true;
-  }
-};
-
 /// Threads that read what is streamed, beside so many that compute.
 int n_reader(int n_thread) { return std::max(1, n_thread / 4); }
 
@@ -118,26 +105,30 @@ Status CpuWeights::give_places(const ParamList& list, const Options& options, co
 
 /// Reads what is resident.
 Status CpuWeights::fill(const ParamList& list, const WeightPlan& plan, int n_thread) const {
-  PackMatrixTask task;
+  std::vector<PackPart> parts;
   for (const Param& param : list.params()) {
     if (param.storage == Storage::table || is_streamed(param)) continue;
     if (param.storage == Storage::matrix)
-      add_parts(param, place(&param), task.parts);
+      add_parts(param, place(&param), parts);
     else
-      task.parts.push_back({.from = param.source->data, .to = place(&param).data});
+      parts.push_back({.from = param.source->data, .to = place(&param).data});
   }
-  if (task.parts.empty()) return {};
+  if (parts.empty()) return {};
   const Content& content = *list.bundle()->content();
-  task.content = &content;
   VLA_TRY(const std::shared_ptr<kernels::Executor> executor, kernels::Executor::shared(n_thread));
-  task.packers.resize(static_cast<std::size_t>(executor->n_thread()));
-  for (Packer& packer : task.packers) packer.reserve(task.parts);
-  task.n_item = static_cast<std::int64_t>(task.parts.size());
-  const kernels::Phase phase = {{&task}, nullptr};
+  std::vector<Packer> packers(static_cast<std::size_t>(executor->n_thread()));
+  for (Packer& packer : packers) packer.reserve(parts);
+  std::atomic<bool> has_failed = false;
+  const auto task =
+      kernels::task_of(static_cast<std::int64_t>(parts.size()), [&](std::int64_t i, kernels::Worker& worker) {
+        Packer& packer = packers[static_cast<std::size_t>(worker.index)];
+        if (!packer.run(content, parts[static_cast<std::size_t>(i)])) has_failed = true;
+      });
+  const kernels::Phase phase = {{task.get()}, nullptr};
   executor->run({&phase, 1});
-  if (task.has_failed) return content.changed();
+  if (has_failed) return content.changed();
   if (!plan.streamed.empty())  // the system need not keep what memory has
-    for (const PackPart& part : task.parts) content.forget(part.from);
+    for (const PackPart& part : parts) content.forget(part.from);
   return {};
 }
 

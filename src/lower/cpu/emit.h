@@ -7,13 +7,17 @@
 #include <string_view>
 
 #include "kernels/attention_kernel.h"
+#include "kernels/cpu_kernels.h"
 #include "kernels/executor.h"
+#include "kernels/linear_kernel.h"
 #include "lower/cpu/cpu_lowering.h"
 
 namespace vla::lower {
 
-/// Keys and values as a kernel's job, without addresses.
-kernels::PackJob pack_sizes(const CpuLowering& l, const PackOp& op);
+using kernels::KindClock;
+using kernels::Task;
+using kernels::task_of;
+using kernels::Worker;
 
 /// A matrix, and where a task keeps its address.
 struct MatrixUse {
@@ -21,20 +25,64 @@ struct MatrixUse {
   const Param* matrix;
 };
 using MatrixUses = std::vector<MatrixUse>;
-/// Makes the task that the executor runs for an operation, when every value has its address. Matrices get theirs before
-/// each run: they are noted in `uses`.
-std::unique_ptr<kernels::Task> emit(const CpuLowering& l, const CpuOp& op, MatrixUses& uses);
 
-/// Bytes of scratch memory that a worker needs for it.
-std::size_t scratch_of(const CpuLowering& l, const CpuOp& op);
+/// How the CPU runs an operation: a file of lower/cpu/ops says it, all of it.
+#pragma GCC diagnostic error "-Wmissing-field-initializers"
+struct CpuRun {
+  std::string kernel;          // as a printed program names it
+  KindClock::Kind kind;        // that its time counts for
+  std::size_t scratch;         // bytes that a worker needs
+  std::unique_ptr<Task> task;  // what the executor runs, with all addresses but those of matrices
+  MatrixUses matrices = {};    // which get theirs before each run
+};
+#define VLA_RUN_OP(Op) CpuRun run_of(const CpuLowering& l, const CpuOp& op, const Op& what);
+VLA_LOWERED_OPS(VLA_RUN_OP)
+VLA_RUN_OP(PackOp)
+VLA_RUN_OP(BlockedOp)
+#undef VLA_RUN_OP
 
+/// When every value has its address.
+CpuRun run_of(const CpuLowering& l, const CpuOp& op);
 /// Operations and bytes of an operation.
 Work work_of(const CpuLowering& l, const CpuOp& op);
-/// The kind that its time counts for. A norm that a product computes as it copies x is part of the product.
-kernels::KindClock::Kind kind_of(const CpuOp& op);
 /// One line: what is computed, the kernel, shapes and layouts.
-std::string text_of(const CpuLowering& l, const CpuOp& op);
+std::string text_of(const CpuLowering& l, const CpuOp& op, const CpuRun& run);
 /// Such a line without the numbers that tell places apart: operations that share it take the same time.
 std::string likeness_of(std::string_view text);
+
+// What files of lower/cpu/ops share.
+
+/// Rows that are cut into items for the threads.
+struct RowItems {
+  /// d: elements of a row.
+  RowItems(const CpuLowering& l, std::int64_t n_row, std::int64_t d);
+
+  std::int64_t begin(std::int64_t item) const { return item * n_each; }
+  std::int64_t end(std::int64_t item) const { return std::min(n_row, (item + 1) * n_each); }
+
+  std::int64_t n_row, n_each, n_item;
+};
+
+inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]; }
+inline std::byte* address(const CpuLowering& l, ValueId id) {
+  return l.address(l.value(id).base) + dtype_size(l.value(id).type, l.value(id).offset);
+}
+/// Null for an operand that there is not.
+inline float* floats(const CpuLowering& l, ValueId id) {
+  return id != kNone ? reinterpret_cast<float*>(address(l, id)) : nullptr;
+}
+inline const kernels::CpuKernels& cpu(const CpuLowering& l) { return *kernels::cpu_kernels(l.use); }
+inline kernels::RowKernel norm_kernel(const CpuLowering& l, const op::Norm& norm) {
+  return norm.kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm;
+}
+kernels::LinearJob::Norm norm_of(const CpuLowering& l, const Node* norm, ValueId weight, ValueId bias);
+kernels::Window window_of(const Shape& x, const op::Window& window, const Shape& y);
+/// Threads that share an operation.
+int threads_for(const CpuLowering& l, double flop);
+/// Keys and values as a kernel's job, without addresses.
+kernels::PackJob pack_sizes(const CpuLowering& l, const PackOp& op);
+/// A product's job, and where matrices will have their addresses.
+kernels::LinearJob job_of(const CpuLowering& l, const CpuOp& op, const LinearOp& linear);
+void note_uses(const LinearOp& linear, kernels::LinearJob& job, MatrixUses& uses);
 
 }  // namespace vla::lower

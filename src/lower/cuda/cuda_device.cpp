@@ -11,30 +11,14 @@
 namespace vla::lower {
 namespace {
 
-/// Kernels that take one product at a time; those that round x norm it on the way.
-class CudaTarget final : public Target {
- public:
-  CudaTarget(const CudaWeights& weights, std::int64_t min_rounded_keys)
-      : weights_(weights), min_rounded_keys_(min_rounded_keys) {}
+constexpr std::int64_t kNoLimit = std::numeric_limits<std::int64_t>::max();
 
-  const void* multiplier(const Param& matrix) const override {
-    return &kKinds[static_cast<int>(weights_[matrix].kind)];
-  }
-  std::size_t max_products() const override { return 1; }
-  std::int64_t max_norm(const Param& matrix) const override {
-    return weights_[matrix].kind == MatrixKind::f32 ? 0 : std::numeric_limits<std::int64_t>::max();
-  }
-  bool takes_windows(const Param&) const override { return false; }
-  bool takes_relu(const Param&) const override { return true; }
-  const Encoding& encoding(const Param& matrix) const override { return weights_[matrix].encoding; }
-  std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
-  std::size_t alignment() const override { return kDeviceAlignment; }
-
- private:
+/// Kernels that round x norm it on the way.
+Multiplier multiplier_of(const CudaWeight& weight) {
   static constexpr char kKinds[4] = {};  // places to tell them apart
-  const CudaWeights& weights_;
-  std::int64_t min_rounded_keys_;
-};
+  const std::int64_t max_norm = weight.kind == MatrixKind::f32 ? 0 : kNoLimit;
+  return {&kKinds[static_cast<int>(weight.kind)], max_norm, false, true, &weight.encoding};
+}
 
 }  // namespace
 
@@ -62,7 +46,7 @@ Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan& pl
   VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, plan, queue_));
   // Attention rounds where products do, as on the CPU.
   const bool rounds = weights_.has(MatrixKind::bf16) || weights_.has(MatrixKind::int8);
-  min_rounded_keys_ = rounds ? vla::min_rounded_keys(params) : std::numeric_limits<std::int64_t>::max();
+  min_rounded_keys_ = rounds ? vla::min_rounded_keys(params) : kNoLimit;
   return {};
 }
 
@@ -109,19 +93,18 @@ void CudaDevice::get(const Slot& slot, void* data, std::size_t size) const {
 Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const LowerOptions& options) {
   if (!graph.problem().empty())
     return Error{Code::internal, "graph", "operands that fit", graph.problem(), "please report this"};
-  const CudaTarget target(weights_, min_rounded_keys_);
+  const Target target = {.multiplier = [this](const Param& matrix) { return multiplier_of(weights_[matrix]); },
+                         .norm_needs = Needs::even_rows,
+                         .max_products = 1,
+                         .min_rounded_keys = min_rounded_keys_,
+                         .keeps_taps = true,
+                         .alignment = kDeviceAlignment};
   CudaLowering l = {{.graph = graph, .options = options, .target = target}, weights_, queue_->n_sm()};
   start(l);
   std::vector<FusedOp> ops = fuse(l);
   store(l, ops);
   choose_layouts(l, std::move(ops));
-  std::vector<Step*> steps;
-  for (CudaOp& op : l.ops) steps.push_back(&op);
-  schedule(l, steps);
-  place(l, steps);
-  std::stable_sort(l.ops.begin(), l.ops.end(), [](const CudaOp& a, const CudaOp& b) {
-    return std::pair(a.phase, a.order) < std::pair(b.phase, b.order);
-  });
+  arrange(l, l.ops);
   if (!arena_ || l.arena_size > arena_->size()) {  // programs made before keep the memory that they were given
     VLA_TRY(arena_, queue_->allocate(l.arena_size, "working memory"));
   }

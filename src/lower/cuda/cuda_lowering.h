@@ -4,28 +4,24 @@
 
 #include "lower/cuda/cuda_queue.h"
 #include "lower/cuda/cuda_weights.h"
-#include "lower/lowering.h"
+#include "lower/ops.h"
 
 /// The passes of a GPU: what its kernels need to lie contiguously, and a launch for each operation.
 namespace vla::lower {
 
 /// Rows of heads, normed and turned, for attention, which may want them as bf16.
 struct HeadOp {
-  Prepared rows;
-};
-/// x, or its norm, as products read it: in codes, bf16 or float32. Once for all products of one x.
-struct RoundOp {
-  ValueId x;
-  const Node* norm;
-  ValueId weight, bias;
+  HeadRows rows;
+
+  std::string text() const { return rows.text() + "heads"; }
+  double flop() const { return 0; }
 };
 
 struct CudaOp : Step {
-  std::variant<LinearOp, HeadOp, RoundOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp, ChannelOp> op;
-  ValueId gate = kNone;                                // of a gated product, what its first matrix makes
-  int n_split = 1;                                     // shares of the depth, or of keys, of blocks of their own
-  ValueId partial = kNone;                             // what those leave
-  std::vector<std::pair<ValueId, ValueId>> keys = {};  // of attention, keys and values of each segment
+  AnyOp<HeadOp> op;
+  ValueId gate = kNone;     // of a gated product, what its first matrix makes
+  int n_split = 1;          // shares of the depth, or of keys, of blocks of their own
+  ValueId partial = kNone;  // what those leave
 };
 
 struct CudaLowering : Lowering {
@@ -61,9 +57,5 @@ ProductShape product_shape(MatrixKind kind, std::int64_t n_row, std::int64_t n_c
 
 /// As Program::work counts it.
 Work work_of(const CudaLowering& l, const CudaOp& op);
-/// The operation's line of Program::text.
-std::string text_of(const CudaLowering& l, const CudaOp& op, const Calls& calls);
-/// Errors: unsupported for sizes that no kernel has.
-Result<Calls> emit(const CudaLowering& l, const CudaOp& op);
 
 }  // namespace vla::lower

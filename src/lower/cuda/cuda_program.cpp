@@ -5,16 +5,9 @@
 #include <algorithm>
 #include <cstring>
 
+#include "lower/cuda/emit.h"
+
 namespace vla::lower {
-namespace {
-
-std::size_t aligned(const Lowering& l, std::size_t size) {
-  const std::size_t unit = l.target.alignment();
-  return (size + unit - 1) / unit * unit;
-}
-
-}  // namespace
-
 Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_ptr<CudaQueue> queue,
                                                    std::vector<std::shared_ptr<cuda::Buffer>> memory,
                                                    const GpuModel* model) {
@@ -29,39 +22,34 @@ Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_
 }
 
 Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
-  const std::size_t kept = aligned(l, l.kept_size);
+  VLA_TRY(own_, queue_->allocate(l.kept_size, "constants"));
   std::vector<std::byte> constants;
-  std::vector<std::size_t> begins(l.values.size(), 0);
-  for (std::size_t i = 0; i < l.values.size(); ++i) {
-    const Value& value = l.values[i];
-    if (value.placement != Value::Placement::constant || value.base != static_cast<ValueId>(i)) continue;
-    begins[i] = constants.size();
-    constants.resize(constants.size() + aligned(l, value.size));
-    std::visit([&](const auto& elements) { std::memcpy(&constants[begins[i]], elements.data(), value.size); },
-               value.node->as<op::Constant>()->values);
+  std::size_t first = l.kept_size;
+  for (const Value& value : l.values) {
+    if (value.placement != Value::Placement::constant) continue;
+    first = std::min(first, value.begin);
+    constants.resize(l.kept_size - first);
+    std::memcpy(&constants[value.begin - first], constant_of(value), value.size);
   }
-  VLA_TRY(own_, queue_->allocate(kept + constants.size(), "constants"));
-  if (!constants.empty()) VLA_CHECK(queue_->upload(own_->address() + kept, constants.data(), constants.size()));
-  const auto address = [&](std::size_t i) -> cuda::Address {
-    const Value& value = l.values[i];
+  if (!constants.empty()) VLA_CHECK(queue_->upload(own_->address() + first, constants.data(), constants.size()));
+  const auto address = [&](const Value& value) -> cuda::Address {
     switch (value.placement) {
       case Value::Placement::arena:
         return arena.address() + value.begin;
       case Value::Placement::kept:
+      case Value::Placement::constant:
         return own_->address() + value.begin;
       case Value::Placement::slot:
         return reinterpret_cast<cuda::Address>(value.slot->place);
       case Value::Placement::parameter:
         return l.weights[*value.node->as<op::Parameter>()->param].data;
-      case Value::Placement::constant:
-        return own_->address() + kept + begins[i];
       case Value::Placement::thread:
         break;
     }
     return 0;
   };
   for (std::size_t i = 0; i < l.values.size(); ++i)
-    l.data.push_back(l.values[i].base == static_cast<ValueId>(i) ? address(i) : 0);
+    l.data.push_back(l.values[i].base == static_cast<ValueId>(i) ? address(l.values[i]) : 0);
   return {};
 }
 

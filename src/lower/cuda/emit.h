@@ -1,0 +1,52 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <algorithm>
+
+#include "cuda/kernels/map.h"
+#include "cuda/kernels/rows.h"
+#include "lower/cuda/cuda_lowering.h"
+
+namespace vla::lower {
+
+/// The launches of an operation: a file of lower/cuda/ops says them. Errors: unsupported for sizes that no kernel has.
+#define VLA_CALLS_OF_OP(Op) Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const Op& what);
+VLA_LOWERED_OPS(VLA_CALLS_OF_OP)
+VLA_CALLS_OF_OP(HeadOp)
+#undef VLA_CALLS_OF_OP
+
+Result<Calls> emit(const CudaLowering& l, const CudaOp& op);
+/// The operation's line of Program::text.
+std::string text_of(const CudaLowering& l, const CudaOp& op, const Calls& calls);
+
+// What files of lower/cuda/ops share.
+
+template <class Job>
+Call call(const cuda::Launch& how, const Job& job) {
+  const auto* bytes = reinterpret_cast<const std::byte*>(&job);
+  return {how, {bytes, bytes + sizeof(job)}};
+}
+inline int narrow(std::int64_t n) { return static_cast<int>(n); }
+inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]; }
+/// more: "heads of at most".
+Error unsupported(const char* what, const char* more, std::int64_t most, std::int64_t found);
+
+/// Element by element over a shape of up to six dimensions, the fastest first; b may be missing.
+template <class Extents>
+cuda::MapJob map_job(const Extents& shape, const float* a, const Extents& a_stride, float* y, const Extents& y_stride) {
+  cuda::MapJob job = {};
+  job.a = a, job.y = y, job.factor = 1;
+  std::fill(std::begin(job.size), std::end(job.size), 1);
+  std::transform(shape.begin(), shape.end(), job.size, narrow);
+  std::copy(a_stride.begin(), a_stride.end(), job.a_step);
+  std::copy(y_stride.begin(), y_stride.end(), job.y_step);
+  return job;
+}
+/// Rows of x, normed unless there is no norm, to the operation's result.
+cuda::NormJob norm_job(const CudaLowering& l, const CudaOp& op, ValueId x, const Node* norm, ValueId weight,
+                       ValueId bias);
+/// Heads of a value, normed or turned, to the operation's result.
+Result<Calls> head_calls(const CudaLowering& l, const CudaOp& op, const HeadRows& rows);
+
+}  // namespace vla::lower

@@ -1,0 +1,96 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/kernels/linear_bf16.h"
+#include "cuda/kernels/linear_f32.h"
+#include "cuda/kernels/linear_int8.h"
+#include "kernels/quantized.h"
+#include "lower/cuda/emit.h"
+
+namespace vla::lower {
+namespace {
+
+/// Blocks of a kernel, by their shape: those of few rows, of 64, of 128.
+template <class Tile>
+Tile tile_of(ProductShape shape) {
+  return shape == ProductShape::few ? Tile::few : shape == ProductShape::rows64 ? Tile::rows64 : Tile::rows128;
+}
+
+void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const CudaWeight& matrix, const Param& weight,
+                 const cuda::Epilogue& end, Calls& calls) {
+  const Value& x = l.value(of);
+  const int rows = narrow(rows_of(x.shape)), columns = narrow(weight.shape[1]), depth = narrow(x.shape[0]);
+  const ProductShape shape = product_shape(matrix.kind, rows, columns, l.n_sm);
+  switch (matrix.kind) {
+    case MatrixKind::f32: {
+      const cuda::LinearF32Job job = {.x = l.at(of),
+                                      .weight = l.param(&weight),
+                                      .x_stride = row_stride(x),
+                                      .n_row = rows,
+                                      .n_column = columns,
+                                      .depth = depth,
+                                      .end = end};
+      calls.push_back(call(cuda::linear_f32(job), job));
+      return;
+    }
+    case MatrixKind::bf16: {
+      const cuda::LinearBf16Job job = {.x = l.at<void>(of),
+                                       .weight = l.param<std::uint16_t>(&weight),
+                                       .x_stride = row_stride(x),
+                                       .weight_stride = bf16_stride(depth),
+                                       .n_row = rows,
+                                       .n_column = columns,
+                                       .depth = depth,
+                                       .n_split = op.n_split,
+                                       .partial = l.at(op.partial),
+                                       .end = end};
+      calls.push_back(call(cuda::linear_bf16(tile_of<cuda::Bf16Shape>(shape), job), job));
+      if (job.n_split > 1) calls.push_back(call(cuda::finish_bf16_partial(job), job));
+      return;
+    }
+    case MatrixKind::ternary:
+    case MatrixKind::int8: {
+      const cuda::LinearInt8Job job = {.x = l.at<std::byte>(of),
+                                       .weight = l.param<std::byte>(&weight),
+                                       .scale = reinterpret_cast<const float*>(matrix.scales),
+                                       .x_stride = x.stride[1],
+                                       .n_row = rows,
+                                       .n_column = columns,
+                                       .depth = narrow(kernels::quantized_depth(depth)),
+                                       .n_split = op.n_split,
+                                       .partial = l.at<int>(op.partial),
+                                       .end = end};
+      const auto kind = matrix.kind == MatrixKind::ternary ? cuda::CodeKind::ternary : cuda::CodeKind::int8;
+      calls.push_back(call(cuda::linear_int8(kind, tile_of<cuda::Int8Shape>(shape), job), job));
+      if (job.n_split > 1) calls.push_back(call(cuda::finish_int8_partial(job), job));
+      return;
+    }
+  }
+}
+
+}  // namespace
+
+Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const LinearOp& linear) {
+  Calls calls;
+  for (std::size_t i = 0; i < linear.linears.size(); ++i) {
+    const Node& node = *linear.linears[i];
+    const auto& product = *node.as<op::Linear>();
+    const CudaWeight& matrix = l.matrix(node);
+    if (product.rule != op::Rule::floats && matrix.kind != MatrixKind::ternary)
+      return Error{Code::unsupported, product.weight->name, "a ternary matrix", dtype_name(matrix.encoding.type),
+                   "use --kernels ggml"};
+    const bool is_gate = linear.gated && i == 0;
+    const ValueId to = is_gate ? op.gate : op.writes[0];
+    cuda::Epilogue end = {};
+    end.bias = l.param(product.bias), end.y = l.at(to);
+    end.is_bf16 = l.value(to).type == DType::bf16;
+    end.y_stride = end.is_bf16 ? l.value(to).stride[1] : product.weight->shape[1];
+    if (!is_gate) {
+      end.activation = linear.activation, end.gate = l.at(op.gate), end.ends_in_relu = linear.ends_in_relu;
+      end.factor = l.at(linear.factor), end.residual = l.at(linear.residual);
+    }
+    add_product(l, op, linear.x, matrix, *product.weight, end, calls);
+  }
+  return calls;
+}
+
+}  // namespace vla::lower

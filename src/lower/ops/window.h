@@ -1,0 +1,31 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "lower/lowering.h"
+
+namespace vla::lower {
+
+/// unfold, max_pool, depthwise
+struct WindowOp {
+  const Node* node;
+  op::Window window;
+  bool takes_largest;  // of the pixels that the window covers; else all of them, or their sum where there are weights
+  ValueId x, weight = kNone, bias = kNone;
+
+  Operands operands() { return {{x, Needs::contiguous}, {weight, Needs::contiguous}, {bias, Needs::contiguous}}; }
+  std::string text() const { return op_name(node->op); }
+  double flop() const { return 0; }
+};
+
+inline WindowOp lowered(const Lowering&, const Node& node, const op::Unfold& op) {
+  return {&node, op.window, false, operand(node, 0)};
+}
+inline WindowOp lowered(const Lowering&, const Node& node, const op::MaxPool& op) {
+  return {&node, op.window, true, operand(node, 0)};
+}
+inline WindowOp lowered(const Lowering&, const Node& node, const op::Depthwise& op) {
+  return {&node, op.window, false, operand(node, 0), operand(node, 1), operand(node, 2)};
+}
+
+}  // namespace vla::lower
