@@ -7,7 +7,7 @@
 namespace vla {
 
 using Clock = std::chrono::steady_clock;
-/// Tells the present time: Clock::now, or a test's, which need not wait.
+/// Returns the current time: Clock::now, or a test's clock that can be advanced without waiting.
 using Now = Clock::time_point (*)();
 
 }  // namespace vla

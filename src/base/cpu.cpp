@@ -15,7 +15,7 @@ namespace vla {
 #if defined(__x86_64__)
 namespace {
 
-/// Tiles are 8 kB of registers that the operating system saves only for processes that request them.
+/// AMX tiles are 8 kB of registers. The operating system saves them only for processes that ask for them.
 bool may_use_tiles() {
   constexpr int kRequestPermission = 0x1023, kTileData = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
   return syscall(SYS_arch_prctl, kRequestPermission, kTileData) == 0;
@@ -34,7 +34,7 @@ bool is_set(unsigned bits, int i) { return (bits >> i & 1U) != 0; }
 
 /// Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2, CPUID leaves 1 and 7.
 Features detect_features() {
-  __builtin_cpu_init();  // which knows whether the operating system saves vector registers
+  __builtin_cpu_init();  // OSXSAVE: XGETBV tells which vector registers the operating system saves
   Features found = {Feature::baseline};
   const Registers leaf1(1, 0), leaf7(7, 0), more(7, 1);
   if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma") || !is_set(leaf1.c, 29))  // F16C

@@ -8,9 +8,9 @@
 
 namespace vla {
 
-/// Something that a processor can do and another cannot.
+/// A feature that some processors have and others lack.
 enum class Feature {
-  baseline,  // what the whole program is compiled for: every processor that runs it
+  baseline,  // the baseline that the whole program is compiled for
   avx2,      // with FMA and F16C
   avx512,    // F, BW, DQ, VL
   avx512_bf16,
@@ -18,14 +18,14 @@ enum class Feature {
   avx_vnni,
   amx_bf16,  // and the operating system permits tiles
   amx_int8,
-  permutes_beside_vnni,  // in the same cycle, as AMD's processors do; Intel's do one or the other
+  permutes_beside_vnni,  // as AMD's processors do in one cycle; Intel's do one or the other
   neon,
   dotprod,    // SDOT
   neon_bf16,  // BFMMLA
   i8mm,       // SMMLA
 };
 
-/// A set of them: what a processor has, or what kernels may use of it.
+/// A set of features: those of a processor, or those that kernels may use.
 class Features {
  public:
   constexpr Features() = default;
@@ -48,8 +48,8 @@ class Features {
   std::uint32_t bits_ = 0;
 };
 
-/// Detects the features of the processor under this process, in a source of its own: a test program that emulates a
-/// better machine links another.
+/// Detects the features of this processor. It has a source file of its own so that a test program that emulates another
+/// machine can link another definition.
 Features detect_features();
 
 /// The same, asked once.

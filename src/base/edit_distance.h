@@ -7,7 +7,7 @@
 
 namespace vla {
 
-/// Letters to be added, removed or changed to make one of the other (Levenshtein).
+/// Levenshtein distance: how many letters must be added, removed or changed to turn one text into the other.
 std::size_t edit_distance(const std::string& a, const std::string& b);
 
 }  // namespace vla

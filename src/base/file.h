@@ -15,16 +15,16 @@ namespace vla {
 /// The bytes of a regular file of at most `limit` bytes. Errors: io, naming the path.
 Result<std::vector<std::byte>> read_file(const std::string& path, std::size_t limit);
 
-/// Writes a file that is not there yet, whole or not at all. Errors: io.
+/// Writes a file that does not exist yet. The file is written completely or not at all. Errors: io.
 Status write_new_file(const std::string& path, std::span<const std::byte> bytes, unsigned mode);
 /// Writes a file whole or not at all: the bytes go into a new file beside it, which takes its name when all of them are
 /// on the disk. A program that is killed leaves nothing, or, on file systems without files that have no name, a part
 /// which the next one removes. What is no regular file, such as a pipe, is written to as it is. Errors: io.
 Status write_file(const std::string& path, std::span<const std::byte> bytes);
-/// The same of bytes that `write` writes to an open file; it returns false, with errno set, where it could not.
+/// The same, for bytes that `write` puts into an open file. `write` returns false, with errno set, on failure.
 using WriteTo = std::function<bool(int file)>;
 Status write_file(const std::string& path, const WriteTo& write);
-/// All of them, or false with errno set.
+/// Writes all bytes; false with errno set on failure.
 bool write_all(int file, std::span<const std::byte> bytes);
 inline Status write_file(const std::string& path, const std::string& text) {
   return write_file(path, std::as_bytes(std::span(text)));

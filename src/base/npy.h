@@ -29,12 +29,12 @@ struct NpyHeader {
 
 /// Whether bytes begin like a .npy file.
 bool is_npy(std::span<const std::byte> bytes);
-/// Reads the header of a file of versions 1 to 3. Errors: bad_observation with `where`.
-/// Source: numpy/lib/format.py.
+/// Reads the header of a .npy file, format versions 1 to 3. Errors: bad_observation with `where`. Source:
+/// numpy/lib/format.py.
 Result<NpyHeader> read_npy_header(std::span<const std::byte> bytes, const std::string& where);
-/// Parses a .npy file, versions 1 to 3. Errors: bad_observation with `where`.
+/// Parses a .npy file, format versions 1 to 3. Errors: bad_observation with `where`.
 Result<NpyArray> parse_npy(std::span<const std::byte> bytes, const std::string& where);
-/// The bytes before the data of a float32 array in C order; the data then start at a multiple of 64.
+/// The header of a float32 array in C order, padded so that the data start at a multiple of 64 bytes.
 std::string npy_header(std::span<const std::size_t> shape);
 /// Writes float32 values (rows, columns). Errors: io.
 Status write_npy(const std::string& path, std::span<const float> values, std::size_t rows, std::size_t columns);

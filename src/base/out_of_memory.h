@@ -6,7 +6,7 @@
 
 namespace vla {
 
-/// Takes no memory itself: the texts fit into the strings.
+/// Allocates nothing itself: its texts fit into the small-string buffers.
 inline Error out_of_memory(const char* where) {
   return {Code::out_of_memory, where, "", "no memory left", "ask again later"};
 }

@@ -15,13 +15,13 @@ struct Character {
   static constexpr std::uint32_t kNotUtf8 = 0xffffffff;
 };
 
-/// The first character of a text that is not empty.
+/// The first code point of a text that is not empty.
 Character first_of(std::string_view text) {
   const auto byte = [&](std::size_t i) { return static_cast<unsigned char>(text[i]); };
   const unsigned lead = byte(0);
   if (lead < 0x80) return {1, lead};
   const std::size_t size = lead >= 0xf0 ? 4 : lead >= 0xe0 ? 3 : 2;
-  constexpr std::uint32_t kLeast[] = {0, 0, 0x80, 0x800, 0x10000};  // shorter ones are not written so long
+  constexpr std::uint32_t kLeast[] = {0, 0, 0x80, 0x800, 0x10000};  // refuses overlong encodings
   if (lead < 0xc2 || lead > 0xf4 || text.size() < size) return {};
   std::uint32_t code = lead & (0x7fu >> size);
   for (std::size_t i = 1; i < size; ++i) {
@@ -32,7 +32,7 @@ Character first_of(std::string_view text) {
   return {size, code};
 }
 
-/// Control characters, line separators, and marks that turn the direction of what follows.
+/// Control characters, line separators and marks of text direction.
 bool moves_the_cursor(std::uint32_t code) {
   return code < 0x20 || (code >= 0x7f && code < 0xa0) || code == 0x200e || code == 0x200f ||
          (code >= 0x2028 && code <= 0x202e) || (code >= 0x2066 && code <= 0x2069);

@@ -7,11 +7,11 @@
 
 namespace vla {
 
-/// Text as a terminal may show it: what would move the cursor, change colours, turn the direction of writing or begin a
-/// line, and bytes that are no UTF-8, come out as `\xNN` or `\u{NNNN}`. Letters of all languages stay.
+/// Escapes a text for a terminal. Characters that move the cursor, change colours, change the text direction or start a
+/// line, and bytes that are not UTF-8, become `\xNN` or `\u{NNNN}`. Letters of all languages stay as they are.
 std::string printable(std::string_view text);
 
-/// Whether `printable` would leave all of it as it is.
+/// Whether `printable` would return the text unchanged.
 bool is_printable(std::string_view text);
 
 }  // namespace vla

@@ -6,7 +6,7 @@
 
 namespace vla {
 
-/// Bytes of memory that this process takes, as the system counts them; 0 where it does not say.
+/// Resident memory of this process in bytes, from the system; 0 where the system does not tell.
 std::size_t resident_size();
 
 }  // namespace vla

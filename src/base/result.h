@@ -9,8 +9,8 @@
 
 namespace vla {
 
-/// One class per exit code and per code on the wire (src/wire/vla.proto), which are the same number; `code_name` gives
-/// the spelling that users see. The last seven are answers of a server.
+/// One class for each exit code and each code on the wire (src/wire/vla.proto); the numbers are the same. `code_name`
+/// gives the spelling that users see. The last seven are answers of a server.
 enum class Code {
   internal,
   usage,
@@ -46,9 +46,9 @@ constexpr const char* code_name(Code code) {
 struct Error {
   Code code = Code::internal;
   std::string where;     // file, key, tensor path or feature name
-  std::string expected;  // may be empty when the finding says it all
-  std::string found;     // `nothing` where something was expected and an empty text came
-  std::string hint;      // the next move, if there is one
+  std::string expected;  // may be empty where `found` says everything
+  std::string found;  // `nothing` if an empty text was found
+  std::string hint;  // what to do next, if that is known
 
   Error() = default;
   Error(Code c, std::string place, std::string wanted, std::string finding, std::string next = {})

@@ -13,8 +13,8 @@
 
 namespace vla {
 
-/// Runs `work` on a thread with the system's default stack, several MB. Signals are blocked there: they belong to the
-/// caller's threads. `where` names the thread in the error. Errors: out_of_memory.
+/// Runs `work` on a new thread with the system's default stack size. The thread blocks all signals, which the caller's
+/// threads handle. `where` names the thread in an error. Errors: out_of_memory.
 template <class Work>
 Result<std::thread> start_thread(const char* where, Work work) {
   sigset_t all, before;

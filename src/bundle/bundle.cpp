@@ -23,10 +23,10 @@ constexpr std::string_view kChecksumPrefix = "xxh3:";
 constexpr std::size_t kDigits = 16;
 constexpr std::string_view kEmbodimentsKey = "embodiments", kEmbodimentPrefix = "embodiment.";
 
-constexpr std::size_t kMaxRobots = 64;  // the published checkpoints have room for 32
-constexpr std::size_t kMaxTag = 256;    // bytes; an act cannot send a longer one
+constexpr std::size_t kMaxRobots = 64;  // published checkpoints use up to 32
+constexpr std::size_t kMaxTag = 256;  // bytes; the longest tag that a request can carry
 
-/// XXH3-64 of a file that comes part by part, with the digits at `digits` read as '0'.
+/// XXH3-64 of a file that arrives in parts. The checksum's own digits, at byte `digits`, count as '0'.
 class Checksum {
  public:
   explicit Checksum(std::size_t digits) : digits_(digits), state_(XXH3_createState(), XXH3_freeState) {
@@ -40,7 +40,7 @@ class Checksum {
   std::string text() const { return fmt::format("{:016x}", XXH3_64bits_digest(state_.get())); }
 
  private:
-  /// Hashes what `part` has of the file up to its byte `end`, or zeros in its place, and takes it off `part`.
+  /// Hashes the bytes of `part` up to the file's byte `end`, or as many zeros, and removes them from `part`.
   void take(std::span<const std::byte>& part, std::size_t end, bool as_zeros) {
     constexpr char kZeros[kDigits + 1] = "0000000000000000";
     const std::size_t size = done_ < end ? std::min(part.size(), end - done_) : 0;
@@ -56,7 +56,8 @@ Status check_sum(Content& content, const Keys& keys, const std::string& name) {
   VLA_TRY(const std::string stated, keys.string(kChecksumKey));
   if (stated.size() != kChecksumPrefix.size() + kDigits || !stated.starts_with(kChecksumPrefix))
     return Error{Code::bad_bundle, name + ": " + std::string(kChecksumKey), "xxh3: and 16 hex digits", stated};
-  // The digits are found by their key, whose text occurs once before them: any other place would not hash to them.
+  // Finds the digits by their key. The key's text occurs once before them: digits at any other place would give another
+  // hash.
   const std::string_view text(reinterpret_cast<const char*>(content.shown().data()), content.shown().size());
   const std::size_t key = text.find(kChecksumKey);
   Checksum checksum(text.find(stated, key) + kChecksumPrefix.size());
@@ -74,7 +75,7 @@ Status check_version(const Keys& keys, const std::string& name) {
                version < kBundleVersion ? "run vla-convert again" : "this bundle needs a newer vla"};
 }
 
-/// Every answer and every report names where the weights come from.
+/// The source of the weights, which every answer and report names.
 Status check_identity(const Keys& keys) {
   for (const char* key : {"vla.arch", "vla.source.name", "vla.source.revision", "vla.source.converter"})
     if (const auto text = keys.string(key); !text) return text.error();
@@ -95,14 +96,14 @@ Status check_tags(const std::vector<std::string>& tags, const std::string& where
   return Error{Code::bad_bundle, where, "different tags", fmt::format("{}", fmt::join(tags, ", "))};
 }
 
-/// The tag in a name of the form embodiment.<tag>.<name>, and the name behind it; both empty for other names.
+/// Splits a name of the form embodiment.<tag>.<name> into tag and name. Both are empty for other names.
 std::pair<std::string, std::string> split_name(const std::string& name) {
   if (!name.starts_with(kEmbodimentPrefix)) return {};
   const std::size_t first = kEmbodimentPrefix.size(), dot = std::min(name.find('.', first), name.size());
   return {name.substr(first, dot - first), name.substr(std::min(dot + 1, name.size()))};
 }
 
-/// A name that is one robot's own has a tag that is listed, and no robot shares it.
+/// Checks a name of one robot: its tag is listed, and the robots share no key or tensor of that name.
 Status check_own_name(const std::string& full, const std::vector<std::string>& tags,
                       const std::function<bool(const std::string&)>& is_shared, const std::string& where) {
   if (!full.starts_with(kEmbodimentPrefix)) return {};
@@ -116,7 +117,7 @@ Status check_own_name(const std::string& full, const std::vector<std::string>& t
   return Error{Code::bad_bundle, where + full, "a name that is not shared by all robots", "both", "convert it again"};
 }
 
-/// The robots of a bundle, and whether everything that is one robot's own can be told from what they share.
+/// Checks the list of robots, and that the keys and tensors of each are separate from those that all share.
 Result<std::vector<std::string>> read_embodiments(const GgufContent& content, const std::string& name) {
   std::vector<std::string> tags;
   if (content.keys.has(kEmbodimentsKey)) {

@@ -28,35 +28,35 @@ struct TensorInfo {
   std::int64_t count() const;
 };
 
-/// An opened, fully checked GGUF file: see docs/bundle.md. Every length in it was compared with the file's size before
-/// it was used, so that a truncated or hostile file is refused instead of read.
+/// An opened and checked GGUF file; see docs/bundle.md. Every length in it is compared with the file's size before use,
+/// so a truncated or hostile file is refused.
 class Bundle {
  public:
-  /// Parses the file and compares checksum and version. Tensors stay in it. Errors: io, bad_bundle, out_of_memory.
+  /// Parses the file and compares checksum and version. Tensor data stay in the file. Errors: io, bad_bundle,
+  /// out_of_memory.
   static Result<Bundle> open(const std::string& path);
-  /// The same on bytes in memory, which must outlive the bundle.
+  /// The same for bytes in memory, which must outlive the bundle.
   static Result<Bundle> parse(std::span<const std::byte> bytes, std::string name);
 
-  /// Tags of the bundle's robots; empty for one robot without a name.
+  /// Tags of the bundle's robots. Empty if the bundle is for one robot without a name.
   const std::vector<std::string>& embodiments() const { return embodiments_; }
-  /// Makes this the bundle of one of its robots: the keys and tensors of that robot lose the prefix with the tag, those
-  /// of the other robots are removed. `tag` is empty where `embodiments` is. Errors: usage, with the tags that there
-  /// are.
+  /// Selects one robot: its keys and tensors lose the prefix with the tag, and those of the other robots are removed.
+  /// `tag` is empty where `embodiments` is. Errors: usage, with the list of tags.
   Status choose(const std::string& tag);
-  /// The robot that was chosen, or empty.
+  /// The selected robot's tag, or empty.
   const std::string& embodiment() const { return embodiment_; }
 
-  /// Removes keys that nobody reads any more, as a vocabulary takes megabytes.
+  /// Removes keys that are not read again. A vocabulary takes megabytes.
   void forget(std::string_view prefix) { keys_.forget(prefix); }
 
   const std::string& path() const { return path_; }
   const Keys& keys() const { return keys_; }
   const std::vector<TensorInfo>& tensors() const { return tensors_; }
   const TensorInfo* find(std::string_view name) const;
-  /// A one- or two-dimensional f32 or f64 tensor of finite values, for statistics: row by row. Errors: bad_bundle.
+  /// Reads statistics: an f32 or f64 tensor of one or two dimensions with finite values, in rows. Errors: bad_bundle.
   Result<std::vector<double>> stats(std::string_view name) const;
   std::size_t file_size() const { return content_->bytes().size(); }
-  /// Where bytes of a tensor are in the file.
+  /// The byte range of a tensor in the file.
   std::ptrdiff_t offset(const std::byte* data) const { return data - content_->bytes().data(); }
   /// The bytes of a tensor or of a part of it, in `buffer` where they come from a file. Errors: bad_bundle, where the
   /// file has been changed since it was opened.

@@ -17,13 +17,13 @@
 namespace vla {
 namespace {
 
-constexpr std::size_t kPiece = std::size_t{1} << 20;  // of a pass over a file
+constexpr std::size_t kPiece = std::size_t{1} << 20;  // bytes read at a time in a pass over a file
 static_assert(kPiece % Content::kBlock == 0);
 constexpr const char* kReplace = "replace a bundle by renaming a new file over it";
 
 Error io_error(const std::string& path, const char* what) { return {Code::io, path, what, std::strerror(errno)}; }
 
-/// How many bytes the system gave: fewer than wanted at the end of the file; -1 with errno.
+/// How many bytes were read: fewer than asked for at the end of the file, -1 with errno on failure.
 ssize_t read_at(int file, std::size_t offset, std::span<std::byte> to) {
   std::size_t done = 0;
   while (done < to.size()) {
@@ -39,7 +39,7 @@ ssize_t read_at(int file, std::size_t offset, std::span<std::byte> to) {
 }  // namespace
 
 Result<std::shared_ptr<Content>> Content::open(const std::string& path) {
-  // O_NONBLOCK: opening a pipe would wait for its writer; a file is not affected.
+  // O_NONBLOCK: opening a pipe would wait for a writer. Regular files are not affected.
   const int file = ::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK);
   if (file < 0) return io_error(path, "a readable bundle");
   const std::shared_ptr<Content> content(new Content(file, path));
@@ -63,7 +63,7 @@ Content::~Content() {
   if (!bytes_.empty()) ::munmap(const_cast<std::byte*>(bytes_.data()), bytes_.size());
 }
 
-/// Bytes that a file must have.
+/// Reads bytes that the file must have.
 Status Content::fill(std::size_t offset, std::span<std::byte> to) const {
   const ssize_t got = read_at(file_, offset, to);
   if (got < 0) return io_error(path_, "a readable bundle");
@@ -106,7 +106,7 @@ Status Content::seal(const std::function<void(std::span<const std::byte>)>& see)
                std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   auto* const first = const_cast<std::byte*>(bytes_.data());
   ::madvise(first, shown_, MADV_DONTNEED);
-  ::mprotect(first, shown_, PROT_NONE);  // zeros would pass for weights
+  ::mprotect(first, shown_, PROT_NONE);  // zeros would look like weights
   shown_ = 0;
   return {};
 }

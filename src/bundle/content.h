@@ -30,31 +30,32 @@ class ReadBuffer {
   std::vector<Line> lines_;
 };
 
-/// The bytes of a bundle: in memory of its owner, or in a file that is read part by part and never as a whole.
+/// The bytes of a bundle: memory that the caller owns, or a file that is read part by part.
 ///
-/// Somebody may write to the file meanwhile. So a first pass over it, `seal`, notes a checksum of every block, and what
-/// is read later is compared with it: bytes are those that the bundle's own checksum stands for, or refused.
+/// Another process may write to the file meanwhile. `seal` therefore reads the file once and keeps a checksum of every
+/// block. Later reads are compared with these checksums, so the bytes returned are those that the bundle's own checksum
+/// covers, or the read is refused.
 class Content {
  public:
   static constexpr std::size_t kBlock = 4096;
 
   explicit Content(std::span<const std::byte> memory) : bytes_(memory), shown_(memory.size()) {}
-  /// Errors: io, bad_bundle (an empty file), out_of_memory (of addresses).
+  /// Errors: io, bad_bundle (empty file), out_of_memory (address space).
   static Result<std::shared_ptr<Content>> open(const std::string& path);
   Content(const Content&) = delete;
   Content& operator=(const Content&) = delete;
   ~Content();
 
-  /// All bytes. Of a file these are addresses: only the first ones, which were shown, may be read there.
+  /// All bytes. Of a file only the part that `show` read may be accessed; the rest are reserved addresses.
   std::span<const std::byte> bytes() const { return bytes_; }
-  /// Reads a file's first bytes, `n` or more. Errors: io, bad_bundle.
+  /// Reads the first `n` bytes of a file or more. Errors: io, bad_bundle.
   Status show(std::size_t n);
   std::span<const std::byte> shown() const { return bytes_.first(shown_); }
 
-  /// Passes all bytes to `see`, one part after the other, and ends what is shown. Errors: io, bad_bundle.
+  /// Calls `see` with each part of the file in order, then releases what `show` read. Errors: io, bad_bundle.
   Status seal(const std::function<void(std::span<const std::byte>)>& see);
 
-  /// Bytes a second that `seal` read and compared; 0 of memory.
+  /// Bytes per second that `seal` read and compared; 0 for memory.
   double read_rate() const { return read_rate_; }
   /// A part of `bytes()`, in `buffer` where there is a file; null where the file has not these bytes any more. Takes no
   /// memory once `buffer` has `buffer_size` of the part. Threads may read at a time.
@@ -62,11 +63,11 @@ class Content {
   static constexpr std::size_t buffer_size(std::size_t size) { return (size / kBlock + 2) * kBlock; }
   /// Has the system read a part of the file ahead, without waiting for it.
   void expect(std::span<const std::byte> part) const;
-  /// Lets the system give up what it keeps of a part of the file: nobody is about to read it again.
+  /// Tells the system that a part of the file is not read again soon, so it may drop it from the page cache.
   void forget(std::span<const std::byte> part) const;
-  /// Bytes of the file that the system keeps in memory, which it gives up where others need it; 0 of memory.
+  /// Bytes of the file in the page cache, which the system frees when memory is short; 0 for memory.
   std::size_t n_cached() const;
-  /// The error to report where `read` gave null.
+  /// The error to report after `read` returned null.
   Error changed() const;
 
  private:
@@ -79,7 +80,7 @@ class Content {
   std::span<const std::byte> bytes_;
   std::size_t shown_ = 0;
   double read_rate_ = 0;
-  std::vector<std::uint64_t> sums_;  // of the blocks of a file
+  std::vector<std::uint64_t> sums_;  // checksums of the file's blocks
 };
 
 }  // namespace vla

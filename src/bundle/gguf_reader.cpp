@@ -19,13 +19,13 @@ namespace {
 enum GgufType : std::uint32_t { u8, i8, u16, i16, u32, i32, f32, boolean, string, array, u64, i64, f64 };
 
 constexpr std::uint64_t kMaxDims = 4;
-// Bytes of a key or a tensor's name, as the format's own description limits them.
+// The longest key or tensor name that the format allows, in bytes.
 constexpr std::uint64_t kMaxNameLength = 65535;
-constexpr std::size_t kMaxShown = 4096;  // bytes of a text that is shown; a path may have as many
+constexpr std::size_t kMaxShown = 4096;  // longest text that is displayed, in bytes; as long as a path may be
 
 using Show = std::function<Status(std::size_t n)>;
 
-/// Walks over the bytes. Every read checks what is left; after the first failure the reader stays failed.
+/// A cursor over the bytes. Every read checks how many are left; after a failure all later reads fail.
 class Cursor {
  public:
   Cursor(std::span<const std::byte> bytes, const std::string& name, const Show& show)
@@ -116,7 +116,7 @@ Result<bool> read_boolean(Cursor& cursor, const std::string& what) {
 bool is_integer(std::uint32_t type) { return type <= i32 || type == u64 || type == i64; }
 bool is_float(std::uint32_t type) { return type == f32 || type == f64; }
 
-/// The least number of bytes that one element takes in the file: bounds an array's length before memory is reserved.
+/// The smallest size of one element in the file. It bounds an array's length before memory is reserved.
 std::uint64_t least_size(std::uint32_t type) {
   constexpr std::uint64_t kSizes[] = {1, 1, 2, 2, 4, 4, 4, 1, 8, 0, 8, 8, 8};
   return kSizes[type];
@@ -162,7 +162,7 @@ Result<Value> read_value(Cursor& cursor, const std::string& what) {
   return cursor.bad(what, "a GGUF value type from 0 to 12", std::to_string(type));
 }
 
-/// Names are displayed and sent to clients: they must not control a terminal, start a new line, or fill a log.
+/// Refuses names that could control a terminal, start a new line or fill a log: they are displayed and sent to clients.
 Status check_shown(const Cursor& cursor, const std::string& what, const std::string& text) {
   if (text.size() > kMaxShown)
     return cursor.bad(printable(what.substr(0, kMaxShown)), fmt::format("text of at most {} bytes", kMaxShown),
@@ -171,13 +171,13 @@ Status check_shown(const Cursor& cursor, const std::string& what, const std::str
                             : cursor.bad(printable(what), "text without control characters", printable(text));
 }
 
-/// Whether the texts of a key, maybe of one robot of several, are for the machine alone: a vocabulary, or JSON.
+/// Whether the texts of a key are for the machine only: a vocabulary, or JSON. The key may belong to one robot.
 bool is_for_machine(std::string_view key) {
   if (key.starts_with("embodiment.")) key.remove_prefix(std::min(key.size(), key.find('.', 11) + 1));
   return key.starts_with("tokenizer.") || key.starts_with("processor.");
 }
 
-/// Everything else may be displayed: the source, tags, and names of features, columns and units.
+/// Checks all other texts, which may be displayed: the source, tags, and names of features, columns and units.
 Status check_shown(const Cursor& cursor, const std::string& key, const Value& value) {
   if (is_for_machine(key)) return {};
   if (const auto* text = std::get_if<std::string>(&value)) return check_shown(cursor, key, *text);
@@ -235,7 +235,7 @@ Result<PlacedTensor> read_tensor(Cursor& cursor, std::uint64_t file_size, const 
   std::uint64_t count = 1;
   for (std::uint32_t d = 0; d < n_dims; ++d) {
     VLA_TRY(const std::uint64_t dim, cursor.scalar<std::uint64_t>(what));
-    if (dim == 0 || dim > file_size / count)  // every element takes a byte or more, so this also bounds the product
+    if (dim == 0 || dim > file_size / count)  // an element takes a byte or more, so this bounds the product too
       return cursor.bad(what, "dimensions that fit into the file", fmt::format("dimension {} is {}", d, dim));
     count *= dim;
     tensor.info.shape.push_back(static_cast<std::int64_t>(dim));
@@ -259,7 +259,7 @@ std::uint64_t round_up(std::uint64_t value, std::uint64_t alignment) {
   return (value + alignment - 1) / alignment * alignment;
 }
 
-/// Tensors must follow each other without gaps, in the order in which they are listed, up to the end of the file.
+/// Checks that tensors follow each other without gaps, in the listed order, to the end of the file.
 Status place(std::span<const std::byte> bytes, const Cursor& cursor, std::uint64_t alignment,
              std::vector<PlacedTensor>& tensors) {
   const std::uint64_t start = round_up(cursor.position(), alignment);

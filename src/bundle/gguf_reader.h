@@ -18,10 +18,10 @@ struct GgufContent {
   std::vector<TensorInfo> tensors;
 };
 
-/// Parses GGUF version 3 (ggml docs/gguf.md). A reader of our own instead of ggml's, because a bundle may be hostile:
-/// here every count and length is compared with the bytes that are left before anything is allocated or read, and the
-/// refusal names the key or tensor. `show` is asked for the first so many bytes before they are read; those of tensors
-/// are not. Errors: bad_bundle, and those of `show`.
+/// Parses GGUF version 3 (ggml docs/gguf.md). We do not use ggml's reader because a bundle may be hostile: this one
+/// compares every count and length with the bytes that are left before it allocates or reads, and names the key or
+/// tensor that it refuses. It calls `show` with the number of leading bytes that it is about to read; tensor data are
+/// not read. Errors: bad_bundle, and those of `show`.
 Result<GgufContent> read_gguf(std::span<const std::byte> bytes, const std::string& name,
                               const std::function<Status(std::size_t n)>& show = {});
 

@@ -25,7 +25,7 @@ void put_text(std::string& out, const std::string& text) {
 
 void pad(std::string& out) { out.append((kGgufAlignment - out.size() % kGgufAlignment) % kGgufAlignment, '\0'); }
 
-/// Writes a value behind the number of its type, as the format counts types.
+/// Writes the format's number for the value's type, then the value.
 struct PutValue {
   std::string& out;
 

@@ -17,8 +17,8 @@ namespace vla {
 using Value = std::variant<bool, std::int64_t, double, std::string, std::vector<std::int64_t>, std::vector<double>,
                            std::vector<std::string>>;
 
-/// The values that a number may have, both ends included. The reader of a number states them: a value that
-/// was never tested is refused at load.
+/// The range of a number, both ends included. Whoever reads a number states its range, so untested values are refused
+/// at load.
 struct Range {
   double low, high;
   bool holds(double value) const { return value >= low && value <= high; }

@@ -136,15 +136,15 @@ struct Unfold {
   static constexpr const char* kName = "unfold";
   Window window;
 };
-/// x [d, width, height, n_view] -> the largest of each feature in the window, pixels beyond the image left out; NaN
-/// where one is NaN: [d, n_column, n_row, n_view]. The padding is at most half of the size.
+/// x [d, width, height, n_view] -> the maximum of each feature in the window: [d, n_column, n_row, n_view]. Pixels
+/// outside of the image are ignored; NaN if any value is NaN. The padding is at most half of the size.
 struct MaxPool {
   static constexpr const char* kName = "max_pool";
   Window window;
 };
-/// x [d, width, height, n_view], weight [d * size^2], bias [d] -> of each feature what the window covers at each of its
-/// places, times that feature's weights, and its bias: [d, n_column, n_row, n_view]. Weights: row, column, feature;
-/// pixels beyond the image are zeros.
+/// x [d, width, height, n_view], weight [d * size^2], bias [d] -> each feature convolved with its own window of
+/// weights, plus its bias: [d, n_column, n_row, n_view]. Weights are ordered by row, column, feature. Pixels outside of
+/// the image are zeros.
 struct Depthwise {
   static constexpr const char* kName = "depthwise";
   Window window;
@@ -154,7 +154,7 @@ struct Depthwise {
 /// tokens.
 struct ChannelAttention {
   static constexpr const char* kName = "channel_attention";
-  static constexpr int kMaxGroup = 64;  // features of a group
+  static constexpr int kMaxGroup = 64;  // features in a group
   int n_group;
 };
 /// Stores x in a slot of its shape.
@@ -172,7 +172,7 @@ using Op = std::variant<op::Input, op::Constant, op::Parameter, op::Linear, op::
                         op::Repeat, op::Reshape, op::Patches, op::PixelShuffle, op::Unfold, op::MaxPool, op::Depthwise,
                         op::ChannelAttention, op::Write>;
 
-/// The operation's word, for messages and printed graphs.
+/// The operation's name in messages and printed graphs.
 inline const char* op_name(const Op& op) {
   return std::visit([](const auto& known) { return known.kName; }, op);
 }

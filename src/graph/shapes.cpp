@@ -20,7 +20,7 @@ struct Rules {
   bool floats() const {
     return std::all_of(in.begin(), in.end(), [](Tensor x) { return x && x.node()->type == DType::f32; });
   }
-  /// b counts for all of a's where it has 1.
+  /// b is broadcast where it has 1 in a dimension.
   static bool broadcasts(const Shape& a, const Shape& b) {
     for (std::size_t i = 0; i < 4; ++i)
       if (b[i] != a[i] && b[i] != 1) return false;
@@ -135,7 +135,7 @@ struct Rules {
     const bool fits = of(0)[0] % op.n_group == 0 && of(0)[0] / op.n_group <= op::ChannelAttention::kMaxGroup;
     return same_as_first(fits && of(0)[3] == 1 && of(1) == of(0) && of(2) == of(0));
   }
-  /// A column of `area` times x's elements for each place of the window.
+  /// A column of `area` * d values for each place of the window.
   ShapeCheck places(const op::Window& w, bool fits, std::int64_t area) const {
     if (in.empty() || !has(in.size()) || !floats() || !fits || w.size < 1 || w.stride < 1) return {false};
     const auto n_place = [&](std::int64_t n) {

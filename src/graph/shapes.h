@@ -13,7 +13,7 @@ struct ShapeCheck {
   DType type = DType::f32;
 };
 
-/// The rules of graph/op.h. `asked` is the requested shape where operands do not determine it.
+/// The shape rules of graph/op.h. `asked` is the requested shape where the operands do not determine it.
 ShapeCheck check_shapes(const Op& op, const std::vector<Tensor>& in, const Shape& asked);
 
 }  // namespace vla

@@ -13,7 +13,7 @@
 
 namespace vla {
 
-/// Sizes, fastest dimension first; what a tensor does not have is 1.
+/// Sizes, fastest dimension first; missing dimensions are 1.
 using Shape = std::array<std::int64_t, 4>;
 
 constexpr std::int64_t count(const Shape& shape) { return shape[0] * shape[1] * shape[2] * shape[3]; }
@@ -22,17 +22,16 @@ std::string shape_text(const Shape& shape);
 /// The same as elements.
 std::vector<std::int64_t> dims(const Shape& shape);
 
-/// A tensor that outlives the graphs which read and write it: inputs, the cache, x, tables made at load. Float32 or
-/// i32.
+/// A tensor that outlives the graphs that read and write it: inputs, the cache, x, tables made at load. Float32 or i32.
 struct Slot {
   DType type = DType::f32;
   Shape shape = {1, 1, 1, 1};
-  void* place = nullptr;  // where its device keeps it, once memory is there
+  void* place = nullptr;  // its place on the device, once memory is allocated
 
   std::size_t size() const { return static_cast<std::size_t>(count(shape)) * 4; }
 };
 
-/// Slots that share one piece of memory: first all are declared, then Device::allocate gives it.
+/// Slots that share one allocation: declare all of them first, then call Device::allocate.
 class Slots {
  public:
   Slot* add(DType type, const Shape& shape) { return &slots_.emplace_back(Slot{type, shape, nullptr}); }
@@ -42,7 +41,7 @@ class Slots {
   std::deque<Slot>& all() { return slots_; }
   /// Bytes of the memory.
   std::size_t size() const { return size_; }
-  /// Keeps the memory that holds the slots, of `size` bytes, as long as this lives.
+  /// Takes ownership of the memory that holds the slots, `size` bytes.
   void hold(std::shared_ptr<void> memory, std::size_t size) { memory_ = std::move(memory), size_ = size; }
 
  private:

@@ -6,13 +6,13 @@
 
 namespace vla {
 
-/// A computation's load on a machine. `flop` counts matrix and attention products alone, two for each multiply-add:
-/// everything else takes time without being the work that a peak is measured in. `bytes` counts every operand and
-/// result once per operation of the program, in its stored dtype, so that a fused operation asks for less.
+/// How much work a computation is. `flop` counts two for each multiply-add of matrix and attention products; other
+/// operations take time but no peak is measured in their units. `bytes` counts every operand and result once per
+/// operation of the program, in its stored dtype, so a fused operation moves fewer.
 struct Work {
   double flop = 0, bytes = 0;
-  double int8 = 0;     // of flop: products of int8 codes
-  double weights = 0;  // of bytes: parameters, which no cache holds from run to run
+  double int8 = 0;  // share of flop that multiplies int8 codes
+  double weights = 0;  // share of bytes that are parameters, which no cache keeps from run to run
 
   Work& operator+=(const Work& other) {
     flop += other.flop;
@@ -25,7 +25,7 @@ struct Work {
   Work times(int n) const { return {n * flop, n * bytes, n * int8, n * weights}; }
 };
 
-/// The products of a node, from its shapes.
+/// The FLOP of a node's products, from its shapes.
 double flop_of(const Node& node);
 
 }  // namespace vla

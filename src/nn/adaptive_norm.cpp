@@ -9,7 +9,8 @@
 namespace vla {
 namespace {
 
-/// Every column with 1 added to `count` of its elements, once and not in every step: scales become factors (1 + scale).
+/// Adds 1 to the first `count` elements of every column, once at load instead of in every step: scales become factors
+/// (1 + scale).
 Tensor scales_to_factors(Graph& g, Tensor modulation, int first, int count) {
   const std::int64_t n = modulation.dim(0);
   const Tensor one = g.constant(fmt::format("adaptive_norm/{}/{}/{}", n, first, count), {n, 1, 1, 1}, [&] {

@@ -14,12 +14,11 @@ struct KeyValue {
   Tensor key, value;
 };
 
-/// softmax(q k / sqrt(d_head) + mask) v, float32 throughout, heads concatenated, over the keys and values of segments
-/// that stand one after the other. q [d_head, n_head, n_query, n_batch], mask [n_key, n_query] or none ->
-/// [d_head * n_head, n_query, n_batch]. Query head h reads key head h / (n_head / n_head_kv). The mask is 0 for a key
-/// that is seen, -infinity for one that is not, and ln(n) for one that represents n equal keys with equal values. Every
-/// query must see at least one key.
-/// Source: lerobot policies/smolvla/smolvlm_with_expert.py eager_attention_forward.
+/// softmax(q k / sqrt(d_head) + mask) v in float32, heads concatenated, over the keys and values of all segments in
+/// order. q [d_head, n_head, n_query, n_batch], mask [n_key, n_query] or none -> [d_head * n_head, n_query, n_batch].
+/// Query head h reads key head h / (n_head / n_head_kv). The mask is 0 for a visible key, -infinity for a hidden one,
+/// and ln(n) for a key that stands for n equal keys with equal values. Every query must see at least one key. Source:
+/// lerobot policies/smolvla/smolvlm_with_expert.py eager_attention_forward.
 Tensor attention(Graph& g, Tensor q, const std::vector<KeyValue>& segments, Tensor mask);
 
 /// The mask of consecutive groups of tokens: a token sees its own group and every earlier one. Sizes in tokens; the
@@ -30,11 +29,10 @@ Tensor group_mask(Graph& g, std::span<const int> group_sizes);
 /// n_query].
 Tensor causal_mask(Graph& g, int n_past, int n_query);
 
-/// The same for tokens of which some are never seen, not even by themselves: [n, n] for n of them. The first must be
-/// seen.
+/// The same for tokens of which some are hidden from every token: [n, n]. The first must be visible.
 Tensor causal_mask(Graph& g, const std::vector<bool>& seen);
-/// The mask of keys that stand for `copies[j]` equal ones each: the logarithm of that, since exp(score + ln n) is n
-/// times exp(score). [copies.size(), n_query], or none where all are 1.
+/// The mask of keys that stand for `copies[j]` equal keys each: ln(copies[j]), since exp(score + ln n) is n times
+/// exp(score). [copies.size(), n_query], or none if all are 1.
 Tensor copies_mask(Graph& g, const std::vector<int>& copies, int n_query);
 
 /// [d_model, n, ...] -> [d_model / n_head, n_head, n, ...].

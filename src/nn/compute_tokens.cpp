@@ -10,10 +10,11 @@
 namespace vla {
 namespace {
 
-/// In the place of the dimension of an operand's tokens: all of it is read, not only the tokens of the result.
+/// Stands for "all of it is read" in place of the dimension of an operand's tokens.
 constexpr int kWhole = -1;
 
-/// The dimension of the old shape that is dimension `dim` of the new one, or kWhole where that is none of its own.
+/// The dimension of the old shape that becomes dimension `dim` of the new one, or kWhole if that dimension is merged or
+/// split.
 int dim_before_reshape(const Shape& from, const Shape& to, int dim) {
   std::int64_t below = 1, inner = 1;
   for (int i = 0; i < dim; ++i) below *= to[static_cast<std::size_t>(i)];
@@ -22,8 +23,8 @@ int dim_before_reshape(const Shape& from, const Shape& to, int dim) {
   return kWhole;
 }
 
-/// An operation's reads for some tokens of its result, which lie in dimension `dim`: for each operand the dimension
-/// of its tokens, or kWhole. None where one token's result needs others in a way that is not told here.
+/// Which tokens an operation reads to compute some tokens of its result, where tokens are dimension `dim`: for each
+/// operand the dimension of its tokens, or kWhole. None for operations that mix tokens.
 std::optional<std::vector<int>> operands_of_tokens(const Node& node, int dim) {
   std::vector<int> dims(node.in.size(), kWhole);
   const bool is_sum = node.as<op::Add>() != nullptr || node.as<op::Multiply>() != nullptr;
@@ -55,11 +56,11 @@ class Narrowing {
   Tensor result() const { return result_; }
 
  private:
-  /// Readers come behind what they read: all are known when it is their operand's turn.
+  /// Visits nodes from last to first, so all readers of a node are known when it is reached.
   void find_whole(Tensor y) {
     const auto& nodes = g_.nodes();
     whole_.assign(nodes.size(), false);
-    std::vector<int> dim(nodes.size(), kWhole);  // of nodes that are read for some tokens
+    std::vector<int> dim(nodes.size(), kWhole);  // nodes of which only some tokens are read
     dim[at(y)] = 1;
     for (auto node = nodes.rbegin(); node != nodes.rend(); ++node) {
       const auto id = static_cast<std::size_t>(node->id);
@@ -76,7 +77,7 @@ class Narrowing {
     }
   }
 
-  /// The tokens of x, which lie in dimension `dim`.
+  /// Selects the tokens of x in dimension `dim`.
   Tensor of_tokens(Tensor x, int dim) {
     const auto known = made_.find({x.node(), dim});
     if (known != made_.end()) return known->second;

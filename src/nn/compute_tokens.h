@@ -6,9 +6,9 @@
 
 namespace vla {
 
-/// Tokens first to first + count - 1 of y: [d, n, n_view] -> [d, count, n_view], where nobody needs the others. What
-/// led to y is recorded again for these tokens alone, back to the values that are needed whole: keys and values of
-/// attention, what is stored or tapped, and results of operations that mix tokens. The rest of y is not computed.
+/// Computes tokens first to first + count - 1 of y only: [d, n, n_view] -> [d, count, n_view]. The operations that led
+/// to y are recorded again for these tokens, back to values that are needed completely: keys and values of attention,
+/// stored or tapped values, and results of operations that mix tokens. The rest of y is not computed.
 Tensor compute_tokens(Graph& g, Tensor y, int first, int count);
 
 }  // namespace vla

@@ -6,13 +6,12 @@
 
 namespace vla {
 
-/// The pixels of images one after the other: [width, height, d, n_view] -> [d, width, height, n_view], for three
-/// features d, which is the order of what follows.
+/// Reorders pixels so that features come first: [width, height, d, n_view] -> [d, width, height, n_view], for d = 3.
 Tensor pixels_first(Graph& g, Tensor images);
 
-/// A convolution with bias as a product of what its window covers: x [d_in, width, height, n_view] -> [d_out, n_column,
-/// n_row, n_view], with size / 2 zeros beyond each side. Columns of the matrix: row, column, feature.
-/// Source: torch.nn.Conv2d(padding = kernel_size // 2).
+/// A convolution with bias, computed as a product over unfolded windows: x [d_in, width, height, n_view] -> [d_out,
+/// n_column, n_row, n_view], with size / 2 zeros of padding on each side. Matrix columns are ordered by row, column,
+/// feature. Source: torch.nn.Conv2d(padding = kernel_size // 2).
 class Convolution : public Module<Convolution> {
  public:
   Convolution(const Scope& s, int d_in, int d_out, int size, int stride);
@@ -23,8 +22,8 @@ class Convolution : public Module<Convolution> {
   Linear product_;
 };
 
-/// A convolution of each feature for itself, with bias: x [d, width, height, n_view] -> the same shape, with size / 2
-/// zeros beyond each side. `kernel`: row, column, feature. Source: torch.nn.Conv2d(groups = d, padding = size // 2).
+/// A depthwise convolution with bias: x [d, width, height, n_view] -> the same shape, with size / 2 zeros of padding on
+/// each side. `kernel` is ordered by row, column, feature. Source: torch.nn.Conv2d(groups = d, padding = size // 2).
 class DepthwiseConvolution : public Module<DepthwiseConvolution> {
  public:
   /// `size` is odd.
@@ -42,8 +41,8 @@ class DepthwiseConvolution : public Module<DepthwiseConvolution> {
   const Param *weight_, *bias_;
 };
 
-/// The largest value of each feature in a window: x [d, width, height, n_view] -> [d, n_column, n_row, n_view].
-/// Source: torch.nn.MaxPool2d(padding = kernel_size // 2).
+/// Max pooling: x [d, width, height, n_view] -> [d, n_column, n_row, n_view]. Source: torch.nn.MaxPool2d(padding =
+/// kernel_size // 2).
 Tensor max_pool(Graph& g, Tensor x, int size, int stride);
 
 }  // namespace vla

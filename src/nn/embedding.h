@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// Ids that do not change from run to run, for a table: [ids.size()] i32. `key` identifies the list within a graph.
+/// Constant ids of a table's rows: [ids.size()] i32. `key` identifies the list within a graph.
 Tensor constant_ids(Graph& g, const std::string& key, const std::vector<std::int32_t>& ids);
 /// 0, 1, ... count - 1.
 Tensor arange(Graph& g, int count);

@@ -44,7 +44,7 @@ class GatedMlp {
     if (sub_norm_eps) sub_norm_.emplace(s / "ffn_sub_norm", d_ff, *sub_norm_eps);
   }
   Tensor operator()(Graph& g, Tensor x) const {
-    const Tensor up = up_(g, x);  // on its own: compilers differ in which argument they evaluate first
+    const Tensor up = up_(g, x);  // evaluated first: compilers differ in the order of arguments
     const Tensor h = g.name(hidden_path_, multiply(g, activate(g, gate_(g, x), activation_), up));
     return down_(g, sub_norm_ ? (*sub_norm_)(g, h) : h);
   }

@@ -12,7 +12,7 @@
 namespace vla {
 namespace {
 
-/// The angle of a pair: the coordinate of a token on one axis, over base^exponent.
+/// The angle of a pair: a token's coordinate on one axis, divided by base^exponent.
 struct Pair {
   int axis;
   float exponent;

@@ -12,7 +12,7 @@ namespace {
 
 constexpr float kTemperature = 10000.0f, kEps = 1e-6f, kTwoPi = 2 * std::numbers::pi_v<float>;
 
-/// Writes a sine and a cosine of index i of n for each of d / 2 frequencies, from `to` on.
+/// Writes sine and cosine of position i of n, for d / 2 frequencies, starting at `to`.
 void put_pairs(int i, int n, int d, float* to) {
   const float angle = static_cast<float>(i + 1) / (static_cast<float>(n) + kEps) * kTwoPi;
   for (int j = 0; j < d; j += 2) {

@@ -8,14 +8,13 @@
 
 namespace vla {
 
-/// Parts that differ in dimension `dim` only, one after the other.
+/// Concatenates tensors along dimension `dim`; all other dimensions are equal.
 inline Tensor concat(Graph& g, std::vector<Tensor> parts, int dim) {
   return parts.size() == 1 ? parts[0] : g.add(op::Concat{dim}, std::move(parts));
 }
-/// Sequences one after the other, in every view: [d, n_1, n_view], [d, n_2, n_view], ... -> [d, n_1 + n_2 + ...,
-/// n_view].
+/// Concatenates sequences in every view: [d, n_1, n_view], [d, n_2, n_view], ... -> [d, n_1 + n_2 + ..., n_view].
 inline Tensor concat_tokens(Graph& g, std::vector<Tensor> parts) { return concat(g, std::move(parts), 1); }
-/// Two feature vectors per token, the first above the second: [d_1, n], [d_2, n] -> [d_1 + d_2, n].
+/// Concatenates features of every token: [d_1, n], [d_2, n] -> [d_1 + d_2, n].
 inline Tensor concat_features(Graph& g, Tensor first, Tensor second) { return concat(g, {first, second}, 0); }
 
 /// Indices first to first + count - 1 of dimension `dim`.
@@ -33,15 +32,15 @@ inline Tensor one_view(Graph& g, Tensor x, int view) { return slice(g, x, 2, vie
 
 /// A constant: [d, n] of the same value.
 Tensor full(Graph& g, float value, std::int64_t d, std::int64_t n);
-/// One vector for every token of `like`: [d, 1] -> [d, n].
+/// Repeats one vector for every token of `like`: [d, 1] -> [d, n].
 Tensor repeat_like(Graph& g, Tensor x, Tensor like);
 /// One column of a table, chosen at run time: [d, n], index [1] i32 -> [d, 1].
 inline Tensor column(Graph& g, Tensor table, Tensor index) { return g.add(op::Gather{}, {table, index}); }
 
-/// a + b; where b has 1 in a dimension it counts for all of a's.
+/// a + b; b is broadcast where it has 1 in a dimension.
 inline Tensor add(Graph& g, Tensor a, Tensor b) { return g.add(op::Add{}, {a, b}); }
 inline Tensor scale(Graph& g, Tensor x, float factor) { return g.add(op::Scale{factor}, {x}); }
-/// Element by element. A factor [d] counts for every token, and [1, n] for every element of a token.
+/// Elementwise product. A factor [d] is broadcast over tokens, [1, n] over the elements of a token.
 inline Tensor multiply(Graph& g, Tensor x, Tensor factor) { return g.add(op::Multiply{}, {x, factor}); }
 /// Source: torch gelu, silu, relu.
 inline Tensor activate(Graph& g, Tensor x, Activation activation) { return g.add(op::Activate{activation}, {x}); }
@@ -50,13 +49,13 @@ inline Tensor silu(Graph& g, Tensor x) { return activate(g, x, Activation::silu)
 
 /// All tokens of all views as one sequence: [d, n, n_view] -> [d, n * n_view].
 Tensor flatten_views(Graph& g, Tensor x);
-/// The same tokens in front of every view's: tokens [d, n_first], x [d, n, n_view] -> [d, n_first + n, n_view].
+/// Puts the same tokens before those of every view: tokens [d, n_first], x [d, n, n_view] -> [d, n_first + n, n_view].
 Tensor prepend_tokens(Graph& g, Tensor tokens, Tensor x);
-/// x with zeros in all features but the first `count`: [d, n] -> the same shape.
+/// Sets all features but the first `count` to zero: [d, n] -> the same shape.
 Tensor zero_features_after(Graph& g, Tensor x, int count);
-/// The columns of a matrix below each other: [d, n] -> [d * n, 1].
+/// Flattens a matrix column by column: [d, n] -> [d * n, 1].
 Tensor flatten(Graph& g, Tensor x);
-/// The same elements as tokens of another width: [d_x, n, n_view] -> [d, n * d_x / d, n_view].
+/// Reshapes to tokens of another width: [d_x, n, n_view] -> [d, n * d_x / d, n_view].
 Tensor reshape_width(Graph& g, Tensor x, std::int64_t d);
 /// Squares of `factor` x `factor` patches become one token: [d, side^2, n_view] -> [d * factor^2, (side / factor)^2,
 /// n_view]. Within a token the patches follow each other row by row. Source: transformers modeling_smolvlm.py
