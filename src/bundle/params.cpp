@@ -28,7 +28,7 @@ bool allows(const Param& param, DType type) {
   return is_float(type) || (param.storage == Storage::matrix && type == DType::i8);
 }
 
-/// Whether a byte is no code: one of four ternary codes is 3, an int8 code is -128, or an int4 one 0.
+/// Whether a byte is not a valid code: 3 for ternary, -128 for int8, 0 for int4.
 bool has_wrong_code(DType type, std::span<const std::byte> codes) {
   std::byte wrong = {};
   if (type == DType::ternary) {
@@ -45,7 +45,7 @@ bool has_wrong_code(DType type, std::span<const std::byte> codes) {
   return wrong != std::byte{};
 }
 
-/// The same of a tensor, read part by part.
+/// The same check for a tensor, which is read part by part.
 Result<bool> has_wrong_code(const Bundle& bundle, DType type, std::span<const std::byte> codes) {
   constexpr std::size_t kPart = sizeof(Int4Block) << 15;
   ReadBuffer buffer;
@@ -62,8 +62,8 @@ const char* codes_text(DType type) {
                                 : "-127 to 127, file has -128";
 }
 
-/// How the bundle's tensor of a matrix that may be floats is encoded; codes have a scale for each row. A row with as
-/// many bytes as elements is int8, also where it has 33 or 66, which blocks of int4 would take too.
+/// The encoding of the bundle's tensor for a matrix that may be quantized; codes have one scale per row. A row of as
+/// many bytes as elements is int8, even if it has 33 or 66 bytes, which int4 blocks could have too.
 Encoding encoding_of(const TensorInfo& tensor, const std::vector<std::int64_t>& shape) {
   if (tensor.type != DType::i8) return {tensor.type};
   const bool is_int4 = !tensor.shape.empty() && tensor.shape[0] != shape[0] &&
@@ -78,8 +78,8 @@ const char* Param::storage_text() const {
   return is_float(encoding.type) ? kNames[static_cast<int>(storage)] : dtype_name(encoding.type);
 }
 
-/// A module of the network has one ternary matrix, and BitLinear's scale has its name; other matrices may lie side by
-/// side.
+/// The name of a parameter's scales. A module has one ternary matrix, whose scale BitLinear calls `scale`. Other
+/// matrices may share a module, so theirs is `<matrix>_scale`.
 std::string scales_name(const std::string& param, const Encoding& encoding) {
   if (encoding.type != DType::ternary) return param + "_scale";
   return param.substr(0, param.rfind('.') + 1) + "scale";
@@ -97,7 +97,7 @@ std::vector<std::int64_t> Param::stored_shape() const {
   return stored;
 }
 
-/// The parameter that is the same tensor of the file, or null.
+/// The parameter that already uses this tensor of the file, or null.
 const Param* ParamList::find(const std::string& name, Storage storage, const std::vector<std::int64_t>& shape) const {
   const TensorInfo* tensor = bundle_ != nullptr ? bundle_->find(name) : nullptr;
   if (tensor == nullptr) return nullptr;

@@ -16,7 +16,7 @@ std::vector<Description::Number> numbers(const std::vector<std::string>& names, 
 
 }  // namespace
 
-/// Processor::create and Robot::open have checked every key that is read here.
+/// Reads keys that Processor::create and Robot::open have checked.
 Description describe(const Engine& engine, const Robot& robot) {
   const Keys& keys = robot.bundle().keys();
   const Processor& processor = robot.processor();

@@ -12,12 +12,12 @@ namespace vla {
 /// Inputs and outputs of a loaded policy, for printing and sending.
 struct Description {
   struct View {
-    std::string name, alias;  // the alias is empty where there is none
-    bool optional;            // leaving it out of an observation declares it absent
-    int width, height;        // pixels of the network; frames of any size are fitted into it
+    std::string name, alias;  // the alias is empty if there is none
+    bool optional;  // an observation without it declares it absent
+    int width, height;  // pixels that the network sees; frames of any size are fitted
   };
   struct Number {
-    std::string name, unit;  // the unit is empty where the bundle does not state it
+    std::string name, unit;  // the unit is empty if the bundle does not state it
   };
   struct State {
     std::string name;
@@ -31,20 +31,20 @@ struct Description {
 
   int horizon;  // rows of a chunk
   std::vector<Number> actions;
-  double rate_hz;                       // rows a second, 0 where the bundle does not state it
-  int solver_horizon, d_action_padded;  // rows and columns of the solver's start, of which a chunk has the first
+  double rate_hz;  // rows per second, 0 if the bundle does not state it
+  int solver_horizon, d_action_padded;  // rows and columns of the solver's start; a chunk has the first of them
   std::string solver, noise;            // kinds
   int n_step;
   double t_start;
-  std::string real_time_chunking;  // what an act's leftover does: guided, inpainted, or empty where it is refused
+  std::string real_time_chunking;  // how an act uses a leftover: guided, inpainted, or empty if it is refused
 
-  std::string embodiment;  // the robot's tag, empty where the bundle is for one and does not name it
+  std::string embodiment;  // the robot's tag, empty if the bundle is for one robot without a name
   std::string path, arch, dtype, checksum, source, revision, converter;
   std::string precision, kernels, device;
   MemoryUse memory;
 };
 
-/// `robot` is one of the engine.
+/// `robot` belongs to the engine.
 Description describe(const Engine& engine, const Robot& robot);
 
 }  // namespace vla

@@ -16,8 +16,8 @@
 namespace vla {
 namespace {
 
-/// Containers throw where there is no memory: the act fails, and the next one starts from scratch. The strings are
-/// short enough to need no memory.
+/// Turns std::bad_alloc of containers into an error: the act fails, and the next one starts from scratch. The strings
+/// fit into the small-string buffers.
 Error no_memory() { return {Code::out_of_memory, "act", "", "no memory left", "free memory"}; }
 
 /// Sets what the network reads.
@@ -36,7 +36,7 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   std::unique_ptr<Engine> engine(new Engine(options));
   VLA_CHECK(engine->take_injected(options.inject));
   VLA_CHECK(engine->open_robots(std::move(file), options));
-  malloc_trim(0);  // what a vocabulary needed while it was read: hundreds of megabytes of the largest
+  malloc_trim(0);  // reading a large vocabulary takes hundreds of megabytes
   VLA_TRY(engine->device_, options.model.empty() ? open_device(options.n_thread, options.kernels, options.device)
                                                  : open_model(options.model, options.kernels, options.device));
   WeightPlan plan;
@@ -48,7 +48,7 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   return engine;
 }
 
-/// Each with the bundle that it would have alone.
+/// Opens each robot with the bundle that it would have alone.
 Status Engine::open_robots(Bundle file, const EngineOptions& options) {
   std::vector<std::string> tags = {options.embodiment};
   if (options.all_robots && options.embodiment.empty() && !file.embodiments().empty()) tags = file.embodiments();
@@ -59,7 +59,7 @@ Status Engine::open_robots(Bundle file, const EngineOptions& options) {
     if (!robots_.empty()) robot->forget_tokenizer();
     robots_.push_back(std::move(robot));
   }
-  robots_.front()->forget_tokenizer();  // with it the others were compared
+  robots_.front()->forget_tokenizer();  // the other robots were compared with it
   return {};
 }
 
@@ -70,7 +70,7 @@ Status Engine::build(const WeightPlan& plan, bool dry) {
   return make_plans(dry);
 }
 
-/// Sizes, and the order in which an act reads matrices, are those of programs that never run.
+/// Lowers programs that never run, for their sizes and the order in which an act reads matrices.
 Result<WeightPlan> Engine::plan_weights(std::size_t budget) {
   VLA_CHECK(build({}, true));
   VLA_TRY(const Plan* largest, plans_->for_shape(robot().network(), robot().largest_shape()));
@@ -87,13 +87,13 @@ Result<WeightPlan> Engine::plan_weights(std::size_t budget) {
                "give more, or make the bundle smaller with vla quantize"};
 }
 
-/// The largest plan of every robot is built, so that the working memory is known before the first request and does not
-/// grow after it.
+/// Builds the largest plan of every robot, so the working memory is known before the first request and does not grow
+/// later.
 Status Engine::make_plans(bool dry) {
   plans_.emplace(PlanContext{*device_, tap_pattern_, dry, nullptr, see_graph_, see_tap_});
   for (const auto& robot : robots_)
     if (const auto plan = plans_->for_shape(robot->network(), robot->largest_shape()); !plan) return plan.error();
-  // Injected values fit the shape of their observation.
+  // Injected values must fit the shape of their observation, so the plan of their shape is built.
   if (!injected_.empty()) plans_.emplace(PlanContext{*device_, tap_pattern_, dry, &injected_, {}, see_tap_});
   return {};
 }
@@ -118,7 +118,7 @@ Result<const Robot*> Engine::robot(const std::string& tag) const {
                tag.empty() ? "none" : tag, "name the robot that the observation is of"};
 }
 
-/// Takes values to inject. The host's inputs and results have names too, beside the network's.
+/// Replaces values by injected ones. The host's inputs and results have names too, like the network's.
 Status Engine::take_injected(const std::vector<Tap>& given) {
   for (const Tap& tap : given) {
     if (tap.path == "chunk" || tap.path == "actions" || tap.path == "tokens")
@@ -175,7 +175,7 @@ Result<std::string> Engine::program_text(Part part) {
 }
 
 Result<StagePredictions> Engine::predict() {
-  if (!dry_) return StagePredictions();  // what it runs overwrites what is in memory
+  if (!dry_) return StagePredictions();  // running it overwrites the working memory
   VLA_TRY(const Plan* plan, plans_->for_shape(robot().network(), robot().largest_shape()));
   return plan->predict(robot().solver().n_step);
 }

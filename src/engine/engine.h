@@ -16,58 +16,56 @@
 namespace vla {
 
 struct EngineOptions {
-  int n_thread = 0;         // 0: every core that the process may use
-  std::string kernels;      // as open_device takes them; empty: the best that the machine has for the bundle's dtype
-  std::string model;        // of a device that is not there, as open_model takes it; only where `dry`
-  std::string device;       // cpu, vulkan:N or cuda:N, as open_device takes them; empty: the CPU
-  std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
-  /// Values at taps that take the place of the computed ones: as the network's own, or as `pixels` and `state`.
+  int n_thread = 0;  // 0: every core that the process may use
+  std::string kernels;  // as open_device takes them; empty: the machine's best for the bundle's dtype
+  std::string model;  // name of a device's model, as open_model takes it; only with `dry`
+  std::string device;  // cpu, vulkan:N or cuda:N; empty: the CPU
+  std::string tap_pattern;  // empty: nothing is recorded
+  /// Values that replace the computed ones at taps: those of the network, or `pixels` and `state`.
   std::vector<Tap> inject = {};
-  bool dry = false;             // reserve memory without filling it: sizes are exact, and `act` must not be called
-  std::string embodiment = {};  // the robot, by its tag; empty where the bundle is for one
-  bool all_robots = false;      // without a tag: every robot of a bundle of several
-  std::function<void(const Graph&)> see_graph = {};  // is shown the graphs of every plan, before they are lowered
-  /// Is shown values at taps, most of them as soon as they are computed, in the place of ActionChunk::taps, which keeps
-  /// all of them.
+  bool dry = false;  // reserve memory without filling it: sizes are exact, and `act` must not be called
+  std::string embodiment = {};  // the robot's tag; empty if the bundle is for one robot
+  bool all_robots = false;  // loads every robot of the bundle; then `embodiment` is empty
+  std::function<void(const Graph&)> see_graph = {};  // called with the graphs of every plan before they are lowered
+  /// Receives values at taps, most of them as soon as they are computed. ActionChunk::taps, which would keep all of
+  /// them, stays empty.
   TapVisitor see_tap = {};
-  std::size_t memory = 0;  // bytes that the process, or on a GPU the policy there, may take; 0: no limit
+  std::size_t memory = 0;  // budget in bytes for the process, or for the policy on a GPU; 0: no limit
 };
 
-/// Memory by what it holds, in bytes: parameters and tables; inputs and cache of the plans; what graphs share while
-/// they run.
+/// Memory by use, in bytes: parameters and tables; inputs and cache of plans; what running graphs share.
 struct MemoryUse {
   std::size_t weights = 0, plan = 0, working = 0;
   std::size_t total() const { return weights + plan + working; }
 };
 
-/// How EngineOptions::memory is kept, in bytes.
+/// How the budget EngineOptions::memory is used, in bytes.
 struct MemoryBudget {
   std::size_t size = 0;
-  std::size_t process = 0;   // what the process took without the engine's memory; 0 on a GPU
-  std::size_t smallest = 0;  // the least budget that would do
-  std::size_t n_read = 0;    // of the file, in every act; 0: all matrices stay in memory
+  std::size_t process = 0;  // the process without the engine's memory; 0 on a GPU
+  std::size_t smallest = 0;  // the least budget that would work
+  std::size_t n_read = 0;  // read from the file in every act; 0: all matrices stay in memory
 };
 
 /// A loaded bundle, ready to act: the device with the parameters, the bundle's robots, and their plans. It owns the
-/// loop that every architecture runs: prefix, cache, solver steps, unnormalize. One thread at a time may call it, and
-/// others its const functions meanwhile.
+/// loop of every architecture: prefix, cache, solver steps, unnormalize. One thread at a time may call its non-const
+/// functions; others may call const functions meanwhile.
 class Engine {
  public:
-  /// Opens, checks and loads a bundle, and builds the largest plans. Errors: io, bad_bundle, unsupported,
-  /// out_of_memory (also where the budget is too small, with the least that would do), device.
+  /// Opens, checks and loads a bundle, and builds the largest plans. Errors: io, bad_bundle, unsupported, device,
+  /// out_of_memory (also if the budget is too small; the error tells the least that works).
   static Result<std::unique_ptr<Engine>> load(const std::string& path, const EngineOptions& options);
 
   /// In the bundle's order; at least one.
   std::vector<const Robot*> robots() const;
-  /// The first one, which is the only one without EngineOptions::all_robots.
+  /// The first robot, and the only one without EngineOptions::all_robots.
   const Robot& robot() const { return *robots_.front(); }
-  /// The robot that answers to this tag; an empty one where there is one robot. Errors: bad_observation, with the tags
-  /// that there are.
+  /// The robot with this tag. A single robot also has the empty tag. Errors: bad_observation, with the list of tags.
   Result<const Robot*> robot(const std::string& tag) const;
 
-  /// Computes the chunk of the robot that the observation names. `leftover`: rows of the previous chunk that are not
-  /// executed yet, which the new chunk continues. Errors: bad_observation, bad_action (a number that is not finite came
-  /// out), unsupported, device, out_of_memory.
+  /// Computes a chunk for the robot that the observation names. `leftover`: rows of the previous chunk that are not
+  /// executed yet, which the new chunk continues. Errors: bad_observation, bad_action (a value is not finite),
+  /// unsupported, device, out_of_memory.
   Result<ActionChunk> act(const Observation& observation, const Noise& noise,
                           const std::optional<Leftover>& leftover = {}) noexcept;
   /// The halves of an act. The host's: any thread may encode while another one computes. Errors: bad_observation,
@@ -91,15 +89,15 @@ class Engine {
   /// Solves for the first robot in another number of steps than the bundle asks for, to measure what a step costs; no
   /// other thread may prepare meanwhile. Errors: bad_bundle, out_of_memory, device.
   Status set_steps(int n_step);
-  /// The program of the prefix or of a step for the first robot's largest observation, one line an operation: phase,
-  /// kernel, MFLOP, MB, what is computed, and how its operand and results lie in memory. Errors: out_of_memory.
+  /// Prints the prefix's or a step's program for the first robot's largest observation, one line per operation: phase,
+  /// kernel, MFLOP, MB, what it computes, and the layouts of operands and results. Errors: out_of_memory.
   enum class Part { prefix, step };
   Result<std::string> program_text(Part part);
-  /// The work of the network for the last observation; empty before the first, and where its plan is gone.
+  /// The network's work for the last observation. Empty before the first, and if its plan was evicted.
   StageWork work() const;
 
-  /// How long the first robot's largest observation takes, of a dry engine: by a model of the device, or on the CPU by
-  /// one phase of each kind, which is run (Program::predictions). Else empty. Errors: out_of_memory.
+  /// Predicts the time of the first robot's largest observation for a dry engine: by a model of the device, or on the
+  /// CPU by running one phase of each kind (Program::predictions). Empty otherwise. Errors: out_of_memory.
   Result<StagePredictions> predict();
 
   const Device& device() const { return *device_; }
@@ -109,16 +107,16 @@ class Engine {
   MemoryUse memory() const;
   /// All zeros without a budget.
   const MemoryBudget& budget() const { return budget_; }
-  /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
+  /// Which kernel multiplies how many matrices, and their encoding: `avx2 (98 bf16)`.
   const std::string& linear_kernels() const { return device_->linear_kernels(); }
-  /// The kernels in use, as `--kernels` names them: those of the machine, or others where the bundle's dtype asks for
+  /// The kernels in use, as `--kernels` names them: the machine's best, or others if the bundle's dtype asks for
   /// float32.
   std::string kernels() const { return device_->kernels(); }
-  /// The precision of the large products: "int8" where activations are int8, and weights ternary or quantized on
-  /// request, "bf16" where activations are rounded to it (sums are float32), else "f32".
+  /// The precision of the large products: "int8" if activations are int8 and weights ternary or quantized on request,
+  /// "bf16" if activations are rounded to bf16 (sums are float32), else "f32".
   Precision precision() const;
   bool has_int8_products() const { return precision() == Precision::int8; }
-  /// The same as text for display.
+  /// The same as a text for display.
   std::string arithmetic() const;
   /// Whether some weights are ternary.
   bool has_ternary() const;
@@ -146,7 +144,7 @@ class Engine {
   std::string tap_pattern_;
   std::function<void(const Graph&)> see_graph_;
   TapVisitor see_tap_;
-  bool dry_, chose_kernels_;         // somebody chose them
+  bool dry_, chose_kernels_;  // the user chose the kernels
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads
   std::unique_ptr<Device> device_;   // goes after what it made

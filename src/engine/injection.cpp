@@ -12,7 +12,7 @@
 namespace vla {
 namespace {
 
-/// The names that are most like this one.
+/// Suggests the most similar names.
 std::vector<std::string> nearest(const std::string& name, const std::set<std::string>& names) {
   constexpr std::size_t kShown = 3;
   std::vector<std::pair<std::size_t, std::string>> all;

@@ -9,26 +9,27 @@
 
 namespace vla {
 
-/// Values that take the place of what the two graphs of a plan compute at their taps. What only led to a value that is
-/// replaced is not computed at all.
+/// Injected values: they replace what a plan's two graphs compute at their taps. Operations that only led to a replaced
+/// value are not run.
 class Injection {
  public:
-  /// `given`, which may be null, and `slots` outlive this.
+  /// `given` may be null. `given` and `slots` must outlive this.
   Injection(const std::vector<Tap>* given, Slots& slots) : given_(given), slots_(slots) {}
 
-  /// For the graphs of a plan, while they are recorded. Values of a step are given for every step.
+  /// The injectors of a plan's graphs, while they are recorded. A step's values are given for every step.
   Injector of_prefix();
   Injector of_step(int n_step);
-  /// When both are recorded. Errors: bad_observation, naming what has no place or a wrong shape.
+  /// Call it after both graphs are recorded. Errors: bad_observation, naming a value without a place or with a wrong
+  /// shape.
   Status check() const;
-  /// When slots have memory: the values of the prefix and of step k.
+  /// Writes the values of the prefix or of step k. The slots must have memory.
   void set(Device& device, int k) const;
   const std::vector<const Slot*>& slots() const { return filled_; }
 
  private:
   struct Place {
     const Slot* slot;
-    std::vector<const Tap*> values;  // of each step, or one
+    std::vector<const Tap*> values;  // one per step, or one for all
   };
   const Slot* replace(const std::vector<std::string>& names, Tensor value);
   const Tap* find(const std::string& name) const;
@@ -37,7 +38,7 @@ class Injection {
   Slots& slots_;
   std::vector<Place> places_;
   std::vector<const Slot*> filled_;
-  std::set<std::string> known_, used_;  // names of the graphs, and those that were given
+  std::set<std::string> known_, used_;  // names in the graphs; names of given values
   Status problem_;
 };
 

@@ -33,7 +33,7 @@ Status check_rows(const Leftover& leftover, const ChunkShape& shape) {
   return wrong(".delay", fmt::format("0 to {}, the rows that are left", n_row), std::to_string(leftover.delay));
 }
 
-/// The settings of the guidance have no default, since every one changes the chunk.
+/// The guidance's settings have no default, since each one changes the chunk.
 Status check_guidance(const Leftover& leftover, Kind kind) {
   const auto& [rows, delay, schedule, max_guidance] = leftover;
   if (kind == Kind::inpainted) {
@@ -47,7 +47,7 @@ Status check_guidance(const Leftover& leftover, Kind kind) {
                max_guidance ? fmt::format("{}", *max_guidance) : "none");
 }
 
-/// How much each of the `n_row` rows counts.
+/// The weight of each of the `n_row` rows.
 std::vector<float> row_weights(const std::string& schedule, int delay, int n_row) {
   std::vector<float> weights(static_cast<std::size_t>(n_row), schedule == "zeros" ? 0.0f : 1.0f);
   std::fill_n(weights.begin(), delay, 1.0f);
@@ -60,8 +60,7 @@ std::vector<float> row_weights(const std::string& schedule, int delay, int n_row
   return weights;
 }
 
-/// The weight of the guidance where `time` of the way from noise (1) to actions (0) is left; in float32, as the
-/// reference.
+/// The guidance's weight at `time`, which falls from 1 (noise) to 0 (actions); in float32 as in the reference.
 float guidance_at(double time, float most) {
   const auto tau = static_cast<float>(1 - time);
   const float left = (1 - tau) * (1 - tau), c = tau == 0 ? most : (1 - tau) / tau;
@@ -71,7 +70,7 @@ float guidance_at(double time, float most) {
 void guide(const Solver& solver, const Leftover& leftover, int n_row, std::span<float> keep, std::span<float> pull,
            std::size_t step) {
   const std::vector<float> weights = row_weights(leftover.schedule, leftover.delay, n_row);
-  // The reference's time runs from 1 to 0. A solver from 0 to 1 has the opposite velocity.
+  // The reference's time runs from 1 to 0. A solver that runs from 0 to 1 has the opposite velocity.
   const double time = std::abs(solver.t_end - solver.times[step].exact);
   const float guidance = guidance_at(time, static_cast<float>(*leftover.max_guidance));
   for (std::size_t row = 0; row < weights.size(); ++row) {
@@ -80,7 +79,7 @@ void guide(const Solver& solver, const Leftover& leftover, int n_row, std::span<
   }
 }
 
-/// The share of the velocity that each row gets: none while it is frozen, then more and more.
+/// The share of the velocity that each row keeps: 0 for frozen rows, then rising to 1.
 void ramp(double rate, int delay, int n_row, std::span<float> keep) {
   std::fill_n(keep.begin(), delay, 0.0f);
   const auto rise = [rate](double x) { return 1 - std::exp(-rate * x); };

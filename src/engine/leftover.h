@@ -11,13 +11,13 @@
 
 namespace vla {
 
-/// Real-time chunking: the rows of the previous chunk that are not executed at the time of the observation. The next
-/// chunk continues them.
+/// Real-time chunking: rows of the previous chunk that the robot has not executed at the time of the observation. The
+/// next chunk continues them.
 struct Leftover {
   std::vector<float> rows;  // the last rows of ActionChunk::normalized, in its columns
-  int delay = 0;            // how many of them will be executed when the next chunk arrives
-  /// For a guided policy alone, and then required: how the weight of a row falls from `delay` on (zeros, ones, linear
-  /// or exp), and the largest weight of the guidance.
+  int delay = 0;  // how many of them the robot will have executed when the next chunk arrives
+  /// Required for a guided policy, refused for others: how a row's weight falls after `delay` (zeros, ones, linear or
+  /// exp), and the largest weight of the guidance.
   std::string schedule;
   std::optional<double> max_guidance;
 };
@@ -25,8 +25,8 @@ struct Leftover {
 /// "guided", "inpainted", or empty for none.
 const char* kind_name(RealTimeChunking::Kind kind);
 
-/// The effect of a Leftover on a solve: a start, and for every step k and row r the velocity
-/// v' = keep * v + pull * (x - target).
+/// How a Leftover changes a solve: a start, and for every step k and row r the velocity v' = keep * v + pull * (x -
+/// target).
 struct Steering {
   std::vector<float> start;       // (horizon, d_action)
   std::vector<float> target;      // the leftover, padded with zeros: (horizon, d_action)
@@ -35,15 +35,15 @@ struct Steering {
 
 /// The sizes of a solve and of a chunk's rows.
 struct ChunkShape {
-  int horizon, d_action;    // of what the network computes
-  int n_row, d_normalized;  // of ActionChunk::normalized
+  int horizon, d_action;  // columns that the network computes
+  int n_row, d_normalized;  // columns of ActionChunk::normalized
 };
 
-/// `start`: the solver's noise. A guided policy is pulled towards the rows in every step; an inpainted one starts from
-/// them, keeps the first `delay`, and changes a later row more the further it is from those. Source: lerobot
-/// policies/rtc/modeling_rtc.py RTCProcessor.denoise_step, get_prefix_weights, whose velocity is computed before its
-/// gradients are asked for, so that the correction is the weighted error itself; policies/groot/groot_n1_7.py
-/// get_action_with_features. Errors: unsupported (the policy does not do it), bad_observation.
+/// `start`: the solver's noise. A guided policy is pulled towards the rows in every step. An inpainted one starts from
+/// the rows, keeps the first `delay`, and changes later rows more the further they are from those. In the reference the
+/// velocity is computed before its gradient is enabled, so the correction is the weighted error itself. Source: lerobot
+/// policies/rtc/modeling_rtc.py RTCProcessor.denoise_step, get_prefix_weights; policies/groot/groot_n1_7.py
+/// get_action_with_features. Errors: unsupported (the policy cannot), bad_observation.
 Result<Steering> steer(const RealTimeChunking& rtc, const Solver& solver, const Leftover& leftover,
                        const ChunkShape& shape, std::vector<float> start);
 

@@ -1,7 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// The build compiles this file with -ffp-contract=off: every operation rounds once, on every machine.
+// The build compiles this file with -ffp-contract=off, so every operation rounds once on every machine.
 #include "engine/noise.h"
 
 #include <array>
@@ -33,7 +32,8 @@ double open_unit(std::uint64_t seed, std::size_t index) {
   return (static_cast<double>(bits) + 0.5) * 0x1p-52;
 }
 
-/// Natural logarithm by its series in (m - 1) / (m + 1), with additions, products and quotients only.
+/// Natural logarithm by its series in (m - 1) / (m + 1). It uses only additions, products and quotients, which round
+/// the same way on every machine.
 double portable_log(double x) {
   int exponent;
   double m = std::frexp(x, &exponent);  // exact
@@ -101,7 +101,7 @@ double normal_quantile(double p) {
 }  // namespace
 
 Result<std::vector<float>> draw_noise(const std::string& kind, std::uint64_t seed, std::size_t count) {
-  if (kind == "none") return std::vector<float>(count, 0.0f);  // the network does not read its start
+  if (kind == "none") return std::vector<float>(count, 0.0f);  // the network does not read the start
   if (kind != "normal" && kind != "uniform") return Error{Code::bad_bundle, "solver.noise", "normal or uniform", kind};
   std::vector<float> values(count);
   for (std::size_t i = 0; i < count; ++i) {

@@ -11,8 +11,8 @@
 namespace vla {
 namespace {
 
-/// Memory that all plans of an engine together may take. A robot uses a few instructions of a few lengths; the limit
-/// bounds clients that send many.
+/// The memory limit of all plans of an engine. A robot sends instructions of a few lengths; the limit protects against
+/// clients that send many.
 constexpr std::size_t kMaxPlanBytes = std::size_t{256} << 20;
 
 TapFilter prefix_filter(const std::string& pattern) {
@@ -20,7 +20,7 @@ TapFilter prefix_filter(const std::string& pattern) {
   return [pattern](const std::string& path) { return match_path(pattern, path); };
 }
 
-/// The step graph is one for all steps: it keeps what any step wants, and `collect_step_taps` picks.
+/// All steps share one graph, so it keeps every tap that any step wants; `collect_step_taps` selects.
 TapFilter step_filter(const std::string& pattern, int n_step) {
   if (pattern.empty()) return {};
   return [pattern, n_step](const std::string& path) {
@@ -30,11 +30,11 @@ TapFilter step_filter(const std::string& pattern, int n_step) {
   };
 }
 
-/// The k of the step after this one: the device counts, so that nothing is uploaded between steps.
+/// The k of the next step. The device counts, so nothing is uploaded between steps.
 Tensor after(Graph& g, Tensor k, int n_step) {
   const Tensor table = g.constant_ids("next step", [n_step] {
     std::vector<std::int32_t> next(static_cast<std::size_t>(n_step));
-    std::iota(next.begin(), next.end() - 1, 1);  // none follows the last
+    std::iota(next.begin(), next.end() - 1, 1);  // after the last step
     return next;
   });
   return column(g, g.add(op::Reshape{}, {table}, {1, n_step, 1, 1}), k);
@@ -140,7 +140,7 @@ Status Plan::run_prefix(std::vector<Tap>& taps) {
   VLA_CHECK(prefix_->run());
   for (std::size_t i = 0; i < prefix_->taps().size(); ++i)
     taps.push_back({prefix_->taps()[i].path, dims(prefix_->taps()[i].shape), prefix_->tap(i)});
-  VLA_CHECK(step_->prepare());  // in the memory that the prefix worked in
+  VLA_CHECK(step_->prepare());  // in the prefix's working memory
   prefix_ended_ = std::chrono::steady_clock::now();
   return {};
 }

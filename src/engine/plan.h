@@ -20,12 +20,12 @@ using StageWork = std::vector<std::pair<std::string, Work>>;
 
 using StagePredictions = std::vector<std::pair<std::string, Program::Prediction>>;
 
-/// A robot's network, as its plans are built from it.
+/// The network of a robot, which its plans are built from.
 struct Network {
   const Policy& policy;
   const Solver& solver;
-  const Slot* conditions;  // [d, n_step]: what depends on the time alone, one column per solver step; or null
-  const Cache& constants;  // what depends on the weights alone
+  const Slot* conditions;  // [d, n_step]: what depends on time only, one column per solver step; or null
+  const Cache& constants;  // what depends on weights only
   int d_action, horizon;
 };
 
@@ -33,37 +33,37 @@ struct Network {
 struct PlanContext {
   Device& device;
   std::string tap_pattern;
-  bool dry;                               // nothing is computed
+  bool dry;  // sizes only, nothing is computed
   const std::vector<Tap>* injected = {};  // null: nothing
   std::function<void(const Graph&)> see_graph = {};
   TapVisitor see_tap = {};
 };
 
-/// The two programs of one input shape, with the memory that outlives a run: inputs, cache, x. Built once, then only
+/// The two programs of one input shape, and the memory that outlives a run: inputs, cache, x. They are built once, then
 /// replayed.
 class Plan {
  public:
-  /// Errors: out_of_memory, internal, bad_observation (values to be injected that have no place).
+  /// Errors: out_of_memory, internal, bad_observation (an injected value without a place).
   static Result<std::unique_ptr<Plan>> build(const Network& network, const InputShape& shape,
                                              const PlanContext& context);
 
-  /// `ahead`: the pixels, where they were sent before; or null.
+  /// `ahead`: pixels that were sent to the device before, or null.
   void set_inputs(std::span<const float> pixels, const Device::Sent* ahead, std::span<const std::int32_t> tokens,
                   std::span<const float> state);
   /// Sets the start of the first step.
   void set_x(std::span<const float> x);
   std::vector<float> x() const { return device_.get(*x_); }
-  /// Sets the steering, of a shape that is steered.
+  /// Sets the steering, for a shape with a leftover.
   void set_steering(const Steering& steering);
 
-  /// Fills the cache, appends what was recorded on the way, and computes what the steps need of the cache alone.
+  /// Runs the prefix, which fills the cache, appends its taps, and computes what the steps need of the cache only.
   Status run_prefix(std::vector<Tap>& taps);
-  /// Solver step k, which follows step k - 1: x <- the solver's next x.
+  /// Runs solver step k after step k - 1: x <- the solver's next x.
   Status run_step(int k);
 
-  /// The stages that the policy's prefix names, with the times of the last run, once x was read.
+  /// The stages that the policy's prefix names, with the last run's times. Read x first.
   const std::vector<Program::Stage>& prefix_stages() const { return prefix_->stages(); }
-  /// When it had ended, once x was read.
+  /// When the prefix ended. Read x first.
   Program::Time prefix_ended() const { return prefix_->ended().value_or(prefix_ended_); }
   const Program& prefix() const { return *prefix_; }
   const Program& step() const { return *step_; }
@@ -71,7 +71,7 @@ class Plan {
   /// The work of the network for one observation: the prefix, stage by stage, and `n_step` solver steps.
   StageWork work(int n_step) const;
 
-  /// How long that takes; nothing of devices that predict nothing (Program::predictions).
+  /// The predicted time of the same; empty if the device predicts nothing (Program::predictions).
   StagePredictions predict(int n_step) const;
 
   /// Appends the taps that the last step recorded, as `step.<k>.<path>`.
@@ -89,13 +89,14 @@ class Plan {
   std::string tap_pattern_;
   Device& device_;
   Slots slots_;
-  // What an act sets, side by side in the order in which it does: one upload. Tokens and state may be null, and so is
-  // the start but for a solver that renoises; the last three are null where nothing is steered.
+  // The inputs of an act, side by side in the order in which the act sets them, so that one upload sends them all.
+  // Tokens and state may be null. `start` is null unless the solver renoises; the last three are null without a
+  // leftover.
   Slot *images_, *tokens_, *state_, *x_, *k_, *start_, *target_, *keep_, *pull_;
   std::uint32_t views_;
   Cache cache_;
   Injection injection_;
-  int i_step_ = 0;  // that runs, or ran last
+  int i_step_ = 0;  // the program that runs or ran last
   std::unique_ptr<Program> prefix_, step_;
   Program::Time prefix_ended_;
 };
@@ -105,8 +106,8 @@ class Plans {
  public:
   explicit Plans(PlanContext context) : context_(std::move(context)) {}
 
-  /// The plan of a shape. If it has to be built and memory is short, all others go. `network` must outlive it. Errors:
-  /// those of Plan::build.
+  /// Returns the plan of a shape, building it if needed; all others are evicted if memory is short. `network` must
+  /// outlive it. Errors: those of Plan::build.
   Result<Plan*> for_shape(const Network& network, const InputShape& shape);
   /// Null where there is none.
   const Plan* find(const Network& network, const InputShape& shape) const;

@@ -11,7 +11,7 @@ namespace {
 
 constexpr int kMaxHorizon = 4096;
 
-/// Load rate: lowers a graph that is used once, and runs it.
+/// Load rate: lowers a graph, runs it once and drops it.
 Status run_once(const Graph& graph, Device& device, bool dry) {
   VLA_CHECK(device.allocate(graph.slots()));
   VLA_TRY(const std::unique_ptr<Program> program, device.lower(graph));
@@ -59,7 +59,7 @@ Status Robot::compute_constants(Device& device, bool dry) {
   return graph.nodes().empty() ? Status() : run_once(graph, device, dry);
 }
 
-/// The table of everything that depends on the time alone.
+/// Computes the table of everything that depends on time only.
 Status Robot::make_conditions(Device& device, bool dry) {
   tables_ = Slots();
   conditions_ = nullptr;
@@ -101,7 +101,7 @@ InputShape Robot::shape_of(const EncodedObservation& observation) const {
           .steered = observation.steering.has_value()};
 }
 
-/// The views of a shape: shapes that are the same for the policy must be equal.
+/// The key for views in a shape: two shapes are equal if the policy builds the same graph.
 std::uint32_t Robot::view_key(std::uint32_t views) const { return policy_->depends_on_which_views() ? views : 0; }
 
 RealTimeChunking Robot::real_time_chunking() const {
@@ -168,7 +168,7 @@ Result<std::vector<float>> Robot::start(const Noise& noise) const {
   return values;
 }
 
-/// Rows far from the training data pull the whole chunk there: most often they are in world units.
+/// Rows far from the training data pull the whole chunk away. Usually they are in world units by mistake.
 Status Robot::check_leftover(const Observation& observation, const Leftover& leftover, Inputs& inputs) const {
   const std::optional<std::string> far = processor_.far_action(leftover.rows);
   if (!far) return {};

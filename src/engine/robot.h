@@ -28,12 +28,12 @@ struct ActShape {
 
 /// The host's part of one observation, made before the device is needed. Vectors keep their memory when filled again.
 struct EncodedObservation {
-  const Robot* robot = nullptr;  // that the observation names
+  const Robot* robot = nullptr;  // the robot that the observation names
   Inputs inputs;
   std::vector<float> x;  // what the solver starts from
   std::optional<Steering> steering;
   Timing timing;
-  std::unique_ptr<Device::Sent> pixels_ahead;  // where they are on their way to the device already
+  std::unique_ptr<Device::Sent> pixels_ahead;  // if the pixels are on their way to the device already
 };
 
 /// The answer to one observation.
@@ -41,29 +41,29 @@ struct ActionChunk {
   int horizon = 0;  // rows
   int d_action = 0;
   std::vector<float> actions;      // (horizon, d_action) in the robot's own units
-  std::vector<float> normalized;   // before unnormalization: what a Leftover takes
+  std::vector<float> normalized;  // before unnormalization, as a Leftover takes it
   std::vector<std::string> notes;  // warnings about this answer
-  bool out_of_range = false;       // one of them: the state is beyond the bundle's bound
+  bool out_of_range = false;  // whether one of them says that the state is out of range
   Timing timing;
   std::vector<Tap> taps;
 };
 
-/// One robot of a bundle: its keys and statistics, its processor, policy and solver, and what the policy computes of
-/// weights and times alone. Nothing of it changes once it is loaded, so that any thread may encode observations.
+/// One robot of a bundle: its keys and statistics, processor, policy and solver, and what the policy computes from
+/// weights and times only. It does not change after it is loaded, so any thread may encode observations.
 class Robot {
  public:
-  /// `bundle` is of one robot. `other`: a robot of the same file before this one, which shares parameters and tokenizer
-  /// with it, or null. Errors: bad_bundle, unsupported.
+  /// `bundle` is that of one robot. `other` is an earlier robot of the same file, which shares parameters and
+  /// tokenizer, or null. Errors: bad_bundle, unsupported.
   static Result<std::unique_ptr<Robot>> open(Bundle bundle, const Robot* other);
-  /// Load rate: what every plan starts from. The device has the parameters; `dry`: nothing is computed. Errors:
-  /// bad_bundle, unsupported, out_of_memory, device.
+  /// Load rate: computes what every plan starts from. The device must have the parameters; with `dry` nothing is
+  /// computed. Errors: bad_bundle, unsupported, out_of_memory, device.
   Status compute_constants(Device& device, bool dry);
-  /// Removes keys that the robots after this one were compared with.
+  /// Removes keys that were kept to compare later robots with.
   void forget_tokenizer() { bundle_.forget("tokenizer."); }
-  /// Solves in another number of steps; plans of this robot must be gone. Errors: bad_bundle, out_of_memory, device.
+  /// Changes the number of solver steps. The robot must have no plans. Errors: bad_bundle, out_of_memory, device.
   Status set_steps(int n_step, Device& device, bool dry);
 
-  /// Fills all of `to` but its robot. Errors: bad_observation, unsupported.
+  /// Fills everything in `to` except its robot. Errors: bad_observation, unsupported.
   Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                 EncodedObservation& to) const;
   /// The same of zeros, of this size. Errors: bad_observation where no observation has it.
@@ -79,14 +79,14 @@ class Robot {
   Network network() const { return {*policy_, solver_, conditions_, constants_, d_action_, horizon_}; }
   InputShape largest_shape() const;
   InputShape shape_of(const EncodedObservation& observation) const;
-  /// The way an act uses a leftover: none where actions are relative to a state, which the rows would have lost.
+  /// How an act uses a leftover. None if actions are relative to a state, because the rows no longer know theirs.
   RealTimeChunking real_time_chunking() const;
   /// Rows of a chunk.
   int horizon() const { return processor_.n_row(horizon_); }
   /// Rows and columns of the solver's start: those of a chunk, or more.
   int solver_horizon() const { return horizon_; }
   int d_action_padded() const { return d_action_; }
-  /// Bytes of what was computed at load.
+  /// Bytes that were computed at load.
   std::size_t constants_size() const { return tables_.size() + constant_slots_.size(); }
 
  private:
@@ -107,7 +107,7 @@ class Robot {
   int horizon_ = 0, d_action_ = 0, d_state_ = 0;
   Slots tables_, constant_slots_;
   const Slot* conditions_ = nullptr;  // in tables_
-  Cache constants_;                   // in constant_slots_
+  Cache constants_;  // its index in constant_slots_
 };
 
 }  // namespace vla

@@ -53,7 +53,7 @@ Tensor Solver::next(Graph& g, Tensor x, Tensor answer, Tensor start, Tensor k) c
   return direct ? answer : add(g, x, scale(g, answer, dt));
 }
 
-/// By the time of the step behind step k, zero behind the last.
+/// The time of the step after step k; 0 after the last.
 Tensor Solver::blend(Graph& g, Tensor answer, Tensor start, Tensor k) const {
   std::vector<float> shares;
   for (int next = 1; next <= n_step; ++next) {

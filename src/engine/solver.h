@@ -20,10 +20,10 @@ struct Solver {
   int n_step = 0;
   bool direct = false, renoises = false;
   double t_end = 0;
-  float dt = 0;  // (t_end - t_start) / n_step, made in double and rounded once, as the reference scales by it
-  /// t_k; t_end is never evaluated. `euler`: t_start + k * dt, made in double and rounded once, as LeRobot.
-  /// `euler_float32`: dt added k times in float32, as openpi; of a sine with a period of 4e-3 the 1e-7 between them is
-  /// a part in 1e4.
+  float dt = 0;  // (t_end - t_start) / n_step, computed in double and rounded once, as in the reference
+  /// t_k; t_end is never evaluated. `euler`: t_start + k * dt in double, rounded once, as in LeRobot. `euler_float32`:
+  /// dt added k times in float32, as in openpi. They differ by 1e-7, which changes a sine with a period of 4e-3 by one
+  /// part in 1e4.
   std::vector<SolverTime> times;
   std::string noise;  // kind of the start: normal, uniform or none
 
@@ -31,8 +31,8 @@ struct Solver {
   /// models_pytorch/pi0_pytorch.py sample_actions.
   static Result<Solver> read(const Keys& keys);
 
-  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x. Of a solver that renoises
-  /// `start` is the first x, and `k` [1] i32 the step.
+  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x. For a solver that renoises,
+  /// `start` is the first x and `k` [1] i32 the step.
   Tensor next(Graph& g, Tensor x, Tensor answer, Tensor start = {}, Tensor k = {}) const;
 
  private:

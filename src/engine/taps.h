@@ -22,20 +22,20 @@ bool match_path(const std::string& pattern, const std::string& path);
 
 /// Writes taps as f32 tensors of a GGUF file. Errors: io.
 Status write_taps(const std::vector<Tap>& taps, const std::string& file);
-/// Reads what `write_taps` or the golden writer wrote. Errors: io, bad_bundle.
+/// Reads a file of `write_taps` or of the golden writer. Errors: io, bad_bundle.
 Result<std::vector<Tap>> read_taps(const std::string& file);
 
-/// How far one recorded value is from what was expected.
+/// The difference of one recorded value from the expected one.
 struct TapDifference {
   std::string path;
-  double max_abs = 0;      // largest difference of two elements
-  double relative = 0;     // the same, in units of the largest expected magnitude
-  double cosine = 1;       // of the two values as vectors
-  bool comparable = true;  // same shape, all values finite
+  double max_abs = 0;  // largest difference of two elements
+  double relative = 0;  // the same, divided by the largest expected magnitude
+  double cosine = 1;  // cosine of the two values as vectors
+  bool comparable = true;  // same shape and all values finite
   bool within(double tolerance) const { return comparable && relative <= tolerance; }
 };
 
-/// Differences of the taps that stand in both lists, in the order of `expected`.
+/// Differences of the taps that both lists have, in the order of `expected`.
 std::vector<TapDifference> compare_taps(const std::vector<Tap>& expected, const std::vector<Tap>& got);
 
 }  // namespace vla

@@ -12,13 +12,13 @@ namespace vla {
 /// Milliseconds per stage, in the order in which the stages ran.
 using Timing = std::vector<std::pair<std::string, double>>;
 
-/// Cuts the time since the last cut into named stages.
+/// Adds the time since the last call as a named stage.
 class StageClock {
  public:
   using Time = std::chrono::steady_clock::time_point;
 
   void lap(Timing& timing, const std::string& stage) { lap(timing, stage, std::chrono::steady_clock::now()); }
-  /// A stage that ended at a time noted elsewhere.
+  /// Adds a stage whose end was noted elsewhere.
   void lap(Timing& timing, const std::string& stage, Time end) {
     timing.emplace_back(stage, std::chrono::duration<double, std::milli>(end - last_).count());
     last_ = end;

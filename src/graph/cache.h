@@ -9,11 +9,10 @@
 
 namespace vla {
 
-/// The values that one graph leaves for the graphs that run after it, by path: the prefix for the solver steps, load
-/// time for both.
+/// Values that one graph leaves for later graphs, by path: the prefix for the solver steps, load time for both.
 class Cache {
  public:
-  /// Keeps `value` under its path, which is a tap too. Called while the graph that computes it is recorded.
+  /// Keeps `value` under its path, which is also a tap. Call it while the graph that computes the value is recorded.
   void put(Graph& g, const std::string& path, Tensor value) {
     Slot* slot = g.slots().add_f32(value.shape());
     value = g.name(path, value);
@@ -21,7 +20,7 @@ class Cache {
     entries_[path] = {slot, g.serial(), value};
   }
   bool has(const std::string& path) const { return entries_.count(path) != 0; }
-  /// The value that `put` kept: itself in the graph that computes it.
+  /// The value that `put` kept; in the graph that computes it, the value itself.
   Tensor get(Graph& g, const std::string& path) const {
     const Entry& entry = entries_.at(path);
     return entry.graph == g.serial() ? entry.value : g.input(entry.slot);

@@ -8,17 +8,17 @@
 
 namespace vla {
 
-/// The export of a library such as libvla-cuda.so: devices of one kind, opened as the Device that graphs run on. It
-/// carries everything that they need, so that it takes no symbol of the program that loads it, and no other program's
-/// ggml can be mistaken for ours. `build` makes sure that both know the same classes.
+/// What a library such as libvla-cuda.so exports: devices of one kind, opened as Device. The library contains
+/// everything it needs and imports no symbol from the program, so that another program's ggml cannot be mistaken for
+/// ours. `build` ensures that both were compiled with the same classes.
 struct DeviceLibrary {
   const char* build;  // kDeviceBuild
-  /// In the order of their numbers. Errors: device, where there is none, with the reason as `found`.
+  /// The devices in order of their index. Errors: device if there is none, with the reason as `found`.
   Result<std::vector<DeviceInfo>> (*list)();
   /// `rounding`: none or bf16. Errors: device, unsupported.
   Result<std::unique_ptr<Device>> (*open)(int index, Rounding rounding);
-  /// A device by the name of a model that says how long programs would take (Program::predictions), to be loaded
-  /// without being filled; null where there are no such models. Errors: usage, unsupported.
+  /// A model of a device, by name, which predicts how long programs would take (Program::predictions). Load it with
+  /// `fill` false. Null if there are no such models. Errors: usage, unsupported.
   Result<std::unique_ptr<Device>> (*model)(const std::string& name, Rounding rounding);
 };
 

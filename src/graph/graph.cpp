@@ -71,7 +71,7 @@ Tensor Graph::name(const std::string& path, Tensor value) {
   Node& node = *value.node();
   if (node.path.empty()) node.path = path;
   if (!filter_ || !filter_(path)) return value;
-  // A value has one path; where it has two, the second is that of a value of its own.
+  // A value has one path. A second path names a copy.
   if (node.path != path || node.tapped || node.as<op::Input>() != nullptr) {
     const Tensor copy = add(op::Reshape{}, {value}, value.shape());
     copy.node()->path = path, copy.node()->tapped = true;

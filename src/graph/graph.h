@@ -15,7 +15,7 @@ namespace vla {
 class Graph;
 struct Node;
 
-/// A value in a graph: a handle that modules and policies pass on. A sequence of tokens is [d_model, n_token].
+/// A handle to a value in a graph. A sequence of tokens is [d_model, n_token].
 class Tensor {
  public:
   Tensor() = default;
@@ -38,8 +38,8 @@ struct Node {
   std::vector<Tensor> in;
   DType type;
   Shape shape;
-  std::string path;     // of the module whose result this is, or empty
-  bool tapped = false;  // its values are kept for `taps`
+  std::string path;  // path of the module that returned it, or empty
+  bool tapped = false;  // whether `taps` keeps its values
 
   template <class T>
   const T* as() const {
@@ -49,50 +49,51 @@ struct Node {
 
 inline const Shape& Tensor::shape() const { return node_->shape; }
 
-/// Says of a path whether its values are to be recorded. An empty function records nothing.
+/// Decides by its path whether a value is recorded. An empty function records nothing.
 using TapFilter = std::function<bool(const std::string& path)>;
-/// Says of a value with a path which slot is read in its place; null leaves it as it is.
+/// Returns the slot that replaces the value of a path, or null to keep the value.
 using Injector = std::function<const Slot*(const std::string& path, Tensor value)>;
 
-/// A list of operations in the order in which they are recorded. It knows no device: a lowering makes a Program of it.
+/// The recorded operations in order. A graph knows no device; a lowering compiles it to a Program.
 class Graph {
  public:
-  /// `slots` receives what is made on the way and outlives a run.
+  /// `slots` receives values that outlive a run.
   explicit Graph(Slots& slots, TapFilter filter = {}, Injector injector = {});
   Graph(const Graph&) = delete;
   Graph& operator=(const Graph&) = delete;
 
-  /// Records an operation on shapes that fit it. `shape` is that of the result where operands do not determine it.
+  /// Records an operation whose operands fit. `shape` is the result's shape where the operands do not determine it.
   Tensor add(Op op, std::vector<Tensor> in, const Shape& shape = {});
 
   Tensor input(const Slot* slot);
   Tensor parameter(const Param* param);
-  /// Values that depend on the shape alone: made once per graph for each `key`.
+  /// Values that depend on shapes alone, made once per graph for each `key`.
   Tensor constant(const std::string& key, const Shape& shape, const std::function<std::vector<float>()>& make);
   Tensor constant_ids(const std::string& key, const std::function<std::vector<std::int32_t>()>& make);
-  /// Values without other readers.
+  /// Values that are read once.
   Tensor constant(std::vector<float> values, const Shape& shape);
 
-  /// Gives `value` its path, under which it is recorded where the filter wants it. What is computed from it must be
-  /// computed from the result, which may be another value: that of the injector.
+  /// Gives `value` its path and records it if the filter says so. Later operations must use the returned tensor, which
+  /// is the injector's if it replaces the value.
   Tensor name(const std::string& path, Tensor value);
   void write(Tensor value, Slot* slot) { add(op::Write{slot}, {value}); }
   Slots& slots() const { return slots_; }
-  /// Tells graphs apart, also those that are gone.
+  /// A number that no other graph has or had.
   std::uint64_t serial() const { return serial_; }
 
-  /// Ends a stage: what was recorded up to here is computed before everything behind it, and a run notes the time.
+  /// Ends a stage: everything recorded so far is computed before what follows, and a run notes the time.
   void end_stage(std::string name) { stages_.push_back({std::move(name), nodes_.size()}); }
   struct Stage {
     std::string name;
-    std::size_t n_node;  // recorded before its end
+    std::size_t n_node;  // nodes recorded before the stage's end
   };
 
   const std::deque<Node>& nodes() const { return nodes_; }
   const std::vector<Stage>& stages() const { return stages_; }
-  /// For each node, whether a write or a tap depends on it.
+  /// For each node, whether a stored or tapped value depends on it.
   std::vector<bool> needed() const;
-  /// The first operation whose operands did not fit; empty where all did. A bug of ours, reported when it is lowered.
+  /// The first operation whose operands do not fit, or empty. It is a bug of ours and is reported when the graph is
+  /// lowered.
   const std::string& problem() const { return problem_; }
 
  private:

@@ -10,23 +10,22 @@
 #include "bundle/params.h"
 #include "graph/slot.h"
 
-/// The operations of a graph: plain structs that say what is computed, not how. Operands are tensors, in the
-/// order of the comment; shapes follow ggml, fastest first. Graph::add checks them when an operation is recorded.
-/// Every pass has a function for each of them and none for the rest, so that one that it does not know fails to
-/// compile.
+/// The operations of a graph: plain structs that say what is computed, not how. Operands are tensors in the order of
+/// the comment; shapes follow ggml, fastest first. Graph::add checks them when an operation is recorded. Every pass
+/// handles each operation by name and has no default, so a new operation does not compile until every pass knows it.
 namespace vla::op {
 
-/// Leaf: what a slot holds when the graph runs.
+/// Leaf: the contents of a slot when the graph runs.
 struct Input {
   static constexpr const char* kName = "input";
   const Slot* slot;
 };
-/// Leaf: values that depend on shapes and configuration alone (masks, rotary tables, ids).
+/// Leaf: values that depend on shapes and configuration only (masks, rotary tables, ids).
 struct Constant {
   static constexpr const char* kName = "constant";
   std::variant<std::vector<float>, std::vector<std::int32_t>> values;
 };
-/// Leaf: a declared vector as a tensor of its own.
+/// Leaf: a declared vector, used as a tensor.
 struct Parameter {
   static constexpr const char* kName = "parameter";
   const Param* param;
@@ -65,13 +64,13 @@ struct Norm {
   NormKind kind;
   float eps;
 };
-/// x [d_head, n_head, n, n_batch], table [d_head, n]: per token d_head/2 cosines, then sines. The pairs
-/// (x_i, x_{i + d_head/2}) turn by the token's angles, in every head and batch alike.
+/// x [d_head, n_head, n, n_batch], table [d_head, n]: d_head/2 cosines per token, then d_head/2 sines. The pairs (x_i,
+/// x_{i + d_head/2}) are rotated by the token's angles, the same in every head and batch.
 struct Rope {
   static constexpr const char* kName = "rope";
 };
-/// q [d_head, n_head, n_query, n_batch], mask [n_key, n_query] if `has_mask`, then segments of keys and values in turn,
-/// each [d_head, n_head_kv, n_key_i, n_batch], which stand one after the other -> [d_head * n_head, n_query, n_batch].
+/// q [d_head, n_head, n_query, n_batch], mask [n_key, n_query] if `has_mask`, then alternating segments of keys and
+/// values, each [d_head, n_head_kv, n_key_i, n_batch], concatenated in order -> [d_head * n_head, n_query, n_batch].
 /// softmax(q k / sqrt(d_head) + mask) v in float32. Every query must see a key.
 struct Attention {
   static constexpr const char* kName = "attention";
@@ -82,7 +81,7 @@ struct Activate {
   static constexpr const char* kName = "activate";
   Activation activation;
 };
-/// a, b -> the shape of a. Where b has 1 in a dimension it counts for all of a's.
+/// a, b -> the shape of a. b is broadcast where it has 1 in a dimension.
 struct Add {
   static constexpr const char* kName = "add";
 };
@@ -94,7 +93,7 @@ struct Scale {
   static constexpr const char* kName = "scale";
   float factor;
 };
-/// Parts that differ in dimension `dim` only, one after the other.
+/// Concatenates parts along dimension `dim`; their other dimensions are equal.
 struct Concat {
   static constexpr const char* kName = "concat";
   int dim;
@@ -105,7 +104,7 @@ struct Slice {
   int dim;
   std::int64_t first;
 };
-/// x with 1 in a dimension -> as often as the result's shape says.
+/// x with 1 in some dimensions -> repeated to the result's shape.
 struct Repeat {
   static constexpr const char* kName = "repeat";
 };
@@ -113,25 +112,25 @@ struct Repeat {
 struct Reshape {
   static constexpr const char* kName = "reshape";
 };
-/// images [width, height, 3, n_view] -> pixels of non-overlapping patches, row by row: [3 * size^2, n_patch, n_view],
-/// of a patch channel, row, column.
+/// images [width, height, 3, n_view] -> pixels of non-overlapping patches, row by row: [3 * size^2, n_patch, n_view]. A
+/// patch is ordered by channel, row, column.
 struct Patches {
   static constexpr const char* kName = "patches";
   int size;
 };
-/// x [d, n, n_view], patches in rows of `n_column` -> squares of factor x factor patches as one token, of a square its
-/// rows one after the other: [d * factor^2, n / factor^2, n_view].
+/// x [d, n, n_view], patches in rows of `n_column` -> each square of factor x factor patches becomes one token, with
+/// the rows of the square in order: [d * factor^2, n / factor^2, n_view].
 struct PixelShuffle {
   static constexpr const char* kName = "pixel_shuffle";
   int n_column, factor;
 };
-/// A square of size x size pixels that moves over an image in steps of `stride`, over `padding` more pixels at each
-/// side than the image has. Along a side of n pixels it has (n + 2 padding - size) / stride + 1 places.
+/// A window of size x size pixels that moves over an image in steps of `stride`. The image is padded by `padding`
+/// pixels on each side. A side of n pixels has (n + 2 padding - size) / stride + 1 places.
 struct Window {
   int size, stride, padding;
 };
-/// x [d, width, height, n_view] -> what the window covers at each of its places, pixels row by row, zeros beyond the
-/// image: [d * size^2, n_column, n_row, n_view]. A product of it is a convolution.
+/// x [d, width, height, n_view] -> the pixels in the window at each of its places, row by row, with zeros outside of
+/// the image (im2col): [d * size^2, n_column, n_row, n_view]. A product over it is a convolution.
 struct Unfold {
   static constexpr const char* kName = "unfold";
   Window window;
