@@ -14,23 +14,23 @@
 
 namespace vla {
 
-/// The heads of an attention, whose width need not be the model's.
+/// The heads of an attention. Their total width may differ from the model's.
 struct Heads {
   int n_head, n_head_kv, d_head;
-  Bias bias = Bias::no;                // of queries, keys and values
-  Bias out_bias = Bias::no;            // of the output product
-  std::optional<float> norm_eps = {};  // queries and keys pass an RMS norm over the head
+  Bias bias = Bias::no;  // whether queries, keys and values have biases
+  Bias out_bias = Bias::no;  // whether the output projection has a bias
+  std::optional<float> norm_eps = {};  // RMS norm of queries and keys over each head
   Rule rule = Rule::floats;
-  std::optional<float> sub_norm_eps = {};  // what all heads give passes an RMS norm before the output product
-  float rope_base = 0;                     // 0: nothing turns by position alone
+  std::optional<float> sub_norm_eps = {};  // RMS norm over the concatenated heads, before the output projection
+  float rope_base = 0;  // 0: no rotary embedding by position
   RotaryAngle rope_angle = RotaryAngle::product;
-  bool plain_keys = false;  // keys have no bias, whatever `bias` says
+  bool plain_keys = false;  // keys have no bias, even if `bias` is set
 
   int d_query() const { return n_head * d_head; }
   int d_key() const { return n_head_kv * d_head; }
-  /// Reads n_head, n_head_kv, d_head and rope_base of `s`, and checks that they go together.
+  /// Reads n_head, n_head_kv, d_head and rope_base of `s` and checks that they fit together.
   static Heads read(const Scope& s, RotaryAngle angle);
-  /// Heads that share the model's width evenly, with biases everywhere.
+  /// Heads that divide the model's width evenly, with all biases.
   static Heads even(int d_model, int n_head, Rule rule = Rule::floats) {
     return {.n_head = n_head,
             .n_head_kv = n_head,
@@ -39,7 +39,7 @@ struct Heads {
             .out_bias = Bias::yes,
             .rule = rule};
   }
-  /// The rotary table of `count` tokens from position `first` on.
+  /// The rotary table of `count` tokens starting at position `first`.
   Tensor rotary(Graph& g, int first, int count) const;
 };
 
@@ -47,11 +47,11 @@ struct Heads {
 void put(Graph& g, Cache& cache, const std::string& path, const KeyValue& kv);
 KeyValue get(Graph& g, const Cache& cache, const std::string& path);
 
-/// The products that make keys and values: `attn_k` and `attn_v`, with `attn_k_norm` where heads are normalized.
+/// The projections to keys and values: `attn_k` and `attn_v`, and `attn_k_norm` if heads are normalized.
 class KeyValueProjection {
  public:
   KeyValueProjection(const Scope& s, int d_context, const Heads& heads);
-  /// Keys and values of a context [d_context, n, ...], keys turned by `rotary` [d_head, n] if given.
+  /// Keys and values of a context [d_context, n, ...]; keys are rotated by `rotary` [d_head, n] if given.
   KeyValue operator()(Graph& g, Tensor context, Tensor rotary = {}) const {
     return (*this)(g, context, context, rotary);
   }
@@ -64,17 +64,17 @@ class KeyValueProjection {
   std::optional<RmsNorm> norm_;
 };
 
-/// Attention of tokens [d_model, n, ...] to a context [d_context, n_key, ...] or to themselves: the products
-/// `attn_q`, `attn_k`, `attn_v` and, of what all heads give (`attn_heads`), `attn_out`, with `attn_q_norm` and
-/// `attn_k_norm` where heads are normalized, and `attn_sub_norm` where what they give is.
+/// Attention of tokens [d_model, n, ...] to a context [d_context, n_key, ...] or to themselves. Projections `attn_q`,
+/// `attn_k`, `attn_v`; the concatenated heads (`attn_heads`) pass `attn_out`. `attn_q_norm`, `attn_k_norm` and
+/// `attn_sub_norm` exist if the heads ask for those norms.
 class Attention {
  public:
   Attention(const Scope& s, int d_model, int d_context, const Heads& heads);
 
   const KeyValueProjection& project() const { return kv_; }
-  /// Attention of x to these segments: the shape of x. `rotary` [d_head, n] turns queries; mask [n_key, n] or none.
+  /// Attention of x to these segments: the shape of x. `rotary` [d_head, n] rotates queries; mask [n_key, n] or none.
   Tensor operator()(Graph& g, Tensor x, Tensor rotary, const std::vector<KeyValue>& segments, Tensor mask = {}) const;
-  /// Tokens that see each other.
+  /// Self-attention without a mask.
   Tensor among(Graph& g, Tensor x, Tensor rotary, Tensor mask = {}) const {
     return (*this)(g, x, rotary, {kv_(g, x, rotary)}, mask);
   }

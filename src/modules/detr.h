@@ -7,18 +7,18 @@
 
 namespace vla {
 
-/// How the layers of a transformer of plain attention and MLPs are built, DETR's and BERT's among them.
+/// Options of a plain transformer layer of attention and MLP, as in DETR and BERT.
 struct DetrFamily {
   int d_model, n_head, d_ff;
   Activation activation;
-  bool pre_norm;  // norms are in front of attention and MLP, else behind the sum with their input
+  bool pre_norm;  // norms before attention and MLP (pre-norm), else after the residual sum (post-norm)
   float norm_eps;
 
   /// Reads d_model, n_head, d_ff, activation, norm and norm_eps of `s`.
   static DetrFamily read(const Scope& s);
 };
 
-/// One branch of a layer with its norm: x + branch(norm(x)), or norm(x + branch(x)).
+/// A residual branch with its norm: x + branch(norm(x)), or norm(x + branch(x)).
 class NormedSum {
  public:
   NormedSum(const Scope& s, const DetrFamily& family)
@@ -34,8 +34,8 @@ class NormedSum {
   bool pre_norm_;
 };
 
-/// Attention of tokens to each other, in which positions are added to what makes queries and keys, but not values;
-/// everywhere here they may be none.
+/// Self-attention in which positions are added to the inputs of queries and keys, but not of values. All positions in
+/// this file may be none.
 class PlacedAttention {
  public:
   PlacedAttention(const Scope& s, const DetrFamily& family)
@@ -70,9 +70,9 @@ class DetrDecoderLayer : public Module<DetrDecoderLayer> {
   DetrDecoderLayer(const Scope& s, const DetrFamily& family);
   /// Keys and values of the encoder's tokens, at these positions, both [d_model, n].
   KeyValue project(Graph& g, Tensor tokens, Tensor position) const;
-  /// Its first part, which depends on nothing else: x, position [d_model, n_query] -> [d_model, n_query].
+  /// Its first part, self-attention of the queries: x, position [d_model, n_query] -> [d_model, n_query].
   Tensor among(Graph& g, Tensor x, Tensor position) const { return among_(g, x, position); }
-  /// The rest of the layer: x as `among` left it.
+  /// The rest of the layer, for the x that `among` returned.
   Tensor forward(Graph& g, Tensor x, Tensor position, const KeyValue& seen) const;
 
  private:

@@ -7,10 +7,10 @@
 
 namespace vla {
 
-/// How the families of encoders differ.
+/// What differs between families of encoders.
 struct EncoderFamily {
   Activation activation;  // of the MLP
-  bool scaled;            // attention and MLP are multiplied feature by feature before they are added (LayerScale)
+  bool scaled;  // attention and MLP are scaled feature by feature before they are added (LayerScale)
   Rule rule = Rule::floats;
   bool plain_keys = false;  // keys have no bias
 };
@@ -28,7 +28,7 @@ constexpr EncoderFamily kTernaryEncoder = {Activation::gelu_tanh, false, Rule::i
 class EncoderBlock : public Module<EncoderBlock> {
  public:
   EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps, EncoderFamily family = kPlainEncoder);
-  /// x [d_model, n, n_view] -> the same shape; `rotary` turns queries and keys [d_head, n], or none.
+  /// x [d_model, n, n_view] -> the same shape; `rotary` [d_head, n] rotates queries and keys, or none.
   Tensor forward(Graph& g, Tensor x, Tensor rotary = {}) const;
 
  private:
@@ -36,7 +36,7 @@ class EncoderBlock : public Module<EncoderBlock> {
   Attention attention_;
   LayerNorm ffn_norm_;
   Mlp mlp_;
-  const Param* attn_scale_ = nullptr;  // of scaled families
+  const Param* attn_scale_ = nullptr;  // only with LayerScale
   const Param* ffn_scale_ = nullptr;
 };
 

@@ -11,8 +11,8 @@ struct Streams {
   Tensor image, text;
 };
 
-/// A layer in which each stream attends to the other as it was before the layer, and passes an MLP.
-/// Source: lerobot_policy_turbovla vl_interaction.py TurboVLAFusionLayer.
+/// A layer in which each stream attends to the other's input of the layer, then passes an MLP. Source:
+/// lerobot_policy_turbovla vl_interaction.py TurboVLAFusionLayer.
 class FusionLayer {
  public:
   FusionLayer(const Scope& s, const DetrFamily& family) : image_(s / "image", family), text_(s / "text", family) {}
@@ -24,7 +24,7 @@ class FusionLayer {
    public:
     Side(const Scope& s, const DetrFamily& family);
     Tensor norm(Graph& g, Tensor x) const { return attn_norm_(g, x); }
-    /// x and both streams as their norms left them.
+    /// x and both streams after their norms.
     Tensor forward(Graph& g, Tensor x, Tensor normed, Tensor other) const;
 
    private:

@@ -10,15 +10,15 @@
 
 namespace vla {
 
-/// The time of a solver step: as the reference's network gets it, and before it was rounded to float32.
+/// The time of a solver step: as the reference's network gets it, and in double before it is rounded to float32.
 struct SolverTime {
   float value;
   double exact;
 };
 
-/// Sines, then cosines, of times at geometrically spaced periods: values of [d, n_time], one column per time. `d` is
-/// even. The times are float32; everything after is double, as in the reference, since in float32 the shortest period
-/// alone would cost 1e-4. Source: lerobot policies/common/vla_utils.py create_sinusoidal_pos_embedding.
+/// Sines, then cosines, of times at geometrically spaced periods: [d, n_time], one column per time. `d` is even. The
+/// times are float32 and everything after is double, as in the reference: in float32 the shortest period would cost
+/// 1e-4. Source: lerobot policies/common/vla_utils.py create_sinusoidal_pos_embedding.
 std::vector<float> sinusoidal_time_embedding(std::span<const float> times, int d, double min_period, double max_period);
 
 /// The solver's times as a policy embeds them, with the periods of `<path>.min_period` and `<path>.max_period`.

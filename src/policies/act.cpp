@@ -1,10 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
 // ACT: ResNet towers, a transformer encoder over the cells of all views and the robot's state, and a decoder that turns
-// a learned query for each row of the chunk into an action. It reads no instruction and knows no noise: one pass. The
-// style variable of its training is zero, so that its encoder is no part of the policy.
-// Reference: lerobot src/lerobot/policies/act/modeling_act.py (ACT.forward).
+// one learned query per chunk row into an action. It reads no instruction, draws no noise and runs in one pass.
+// Training's style variable is zero at inference, so its encoder is not part of the policy. Reference: lerobot
+// src/lerobot/policies/act/modeling_act.py
 
 #include "modules/detr.h"
 #include "modules/vision/resnet.h"
@@ -18,7 +17,7 @@ namespace {
 
 class Act final : public Policy {
   int d_state_, d_environment_, horizon_;
-  int n_token_;  // in front of the views': style, robot, environment
+  int n_token_;  // tokens before those of the views: style, robot, environment
   DetrFamily family_;
   ResNet vision_;  // observation rate
   Linear projector_;
@@ -68,7 +67,7 @@ class Act final : public Policy {
     return check_prefix(shape.n_view, ResNet::n_cell(shape.width) * ResNet::n_cell(shape.height), n_token_);
   }
 
-  /// Queries start from zero: what the first layer's self-attention makes of them depends on nothing else.
+  /// Queries start at zero, so the first layer's self-attention is the same for every observation.
   void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {
     const Tensor zero = full(g, 0.0f, family_.d_model, horizon_);
     cache.put(g, "queries", decoder_.front().among(g, zero, queries(g)));
@@ -103,7 +102,7 @@ class Act final : public Policy {
   static Tensor cells(Graph& g, Tensor map) {
     return g.add(op::Reshape{}, {map}, {map.dim(0), map.dim(1) * map.dim(2) * map.dim(3), 1, 1});
   }
-  /// The positions of all tokens of the encoder; views are not told apart.
+  /// The positions of all encoder tokens. Views have the same positions.
   Tensor positions(Graph& g, Tensor map) const {
     const Tensor of_cells =
         sine_positions(g, static_cast<int>(map.dim(1)), static_cast<int>(map.dim(2)), family_.d_model);

@@ -1,10 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// BitVLA: SigLIP and BitNet b1.58 with ternary weights and activations of 8 bits. Parallel decoding: the language model
-// reads a zero embedding for each value of a chunk behind the prompt, every token sees all others, and an MLP-ResNet
-// turns the features there into actions, in one pass. Reference: BitVLA openvla-oft
-// bitvla/model/bitvla_for_action_prediction.py (predict_action).
+// BitVLA: SigLIP and BitNet b1.58 with ternary weights and 8-bit activations. Parallel decoding: after the prompt the
+// language model reads a zero embedding for each value of a chunk, with full attention, and an MLP-ResNet turns the
+// features there into actions in one pass. Reference: BitVLA openvla-oft bitvla/model/bitvla_for_action_prediction.py
+// (predict_action)
 
 #include "modules/action/mlp_resnet.h"
 #include "modules/language/qwen.h"
@@ -73,7 +72,7 @@ class BitVla final : public Policy {
   }
 
  private:
-  /// Index of the token that the state replaces: the one behind the views.
+  /// Index of the token that the state replaces: the one after the views.
   int state_place() const { return places_.min_tokens(); }
   Tensor embed(Graph& g, Tensor tokens, int first, int count) const {
     return lm_.embed(g, slice_ids(g, tokens, first, count));

@@ -21,13 +21,13 @@
 namespace vla {
 namespace {
 
-constexpr int kTimes = 1000;  // rows of the reference's time table
+constexpr int kTimes = 1000;  // rows in the reference's time table
 
 class Evo1 final : public Policy {
-  /// The treatment of the prompt's pads and of the image tokens of views that are absent.
+  /// How padding in the prompt and image tokens of absent views are treated.
   enum class MaskedRows {
-    zero_attention,    // flash-attention: a row for itself, which the head sees
-    causal_attention,  // any other attention: it sees the rows before it, and the head sees it
+    zero_attention,  // flash-attention: the row attends to nothing else, and the head sees it
+    causal_attention,  // other attention: the row sees the rows before it, and the head sees it
     unseen             // the head does not see it
   };
   static constexpr int kAbsent = -1;
@@ -95,7 +95,7 @@ class Evo1 final : public Policy {
   bool depends_on_which_views() const override { return in_place_; }
 
   Tensor condition(Graph& g, std::span<const SolverTime> times) const override {
-    // The reference takes a row of its table by the time in double.
+    // The reference looks up its time table by the time in double.
     std::vector<std::int32_t> rows;
     for (const SolverTime& time : times)
       rows.push_back(std::min(kTimes - 1, static_cast<int>(time.exact * time_scale_)));
@@ -129,11 +129,11 @@ class Evo1 final : public Policy {
   }
 
  private:
-  /// The rows that the language model reads, and those that only the head sees.
+  /// Splits the rows into those that the language model reads and those that only the head sees.
   struct Rows {
     std::vector<Tensor> parts;  // [d_model, n] each
     std::vector<int> positions;
-    std::vector<bool> seen;  // by the rows behind
+    std::vector<bool> seen;  // whether later rows see it
     std::vector<CrossHead::Kept> kept;
 
     void add(Tensor part, int first, bool is_seen) {
@@ -147,7 +147,7 @@ class Evo1 final : public Policy {
     return lm_.embed(g, constant_ids(g, "pads", ids));
   }
 
-  /// For every slot the view that fills it, as an index of the views that are present, or kAbsent.
+  /// For every slot the index of the present view that fills it, or kAbsent.
   std::vector<int> fill_slots(const PrefixInputs& in) const {
     std::vector<int> slots(static_cast<std::size_t>(places_.max_views()), kAbsent);
     int next = 0;
@@ -157,7 +157,7 @@ class Evo1 final : public Policy {
     return slots;
   }
 
-  /// Tokens keep the positions that they have in the whole prompt, whatever is left out of it.
+  /// Tokens keep their positions in the whole prompt, whatever is left out.
   Rows arrange(Graph& g, Tensor image, const PrefixInputs& in, const Cache& cache) const {
     Rows rows;
     int n_absent = 0;

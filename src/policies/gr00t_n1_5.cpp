@@ -1,9 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
 // GR00T N1.5: Eagle 2.5 prefix (SigLIP, the first layers of Qwen3 and its final norm), self-attention over its
-// features, a diffusion transformer over tokens of state, future and actions that looks at all of them, flow matching
-// from noise (t = 0) to actions (t = 1). Reference: lerobot 0.4.4 src/lerobot/policies/groot (groot_n1.py,
+// features, a diffusion transformer over tokens of state, future and actions that attends to all features, flow
+// matching from noise (t = 0) to actions (t = 1). Reference: lerobot 0.4.4 src/lerobot/policies/groot (groot_n1.py,
 // action_head).
 
 #include "modules/action/groot_head.h"

@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
 // GR00T N1.7: Qwen3-VL prefix whose features are read before the final norm, self-attention over them, a diffusion
-// transformer that looks at text and images in turn, flow matching from noise (t = 0) to actions (t = 1). Reference:
+// transformer that attends to text and images in turn, flow matching from noise (t = 0) to actions (t = 1). Reference:
 // lerobot src/lerobot/policies/groot (groot_n1_7.py).
 
 #include "modules/action/groot_head.h"

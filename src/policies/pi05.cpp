@@ -1,9 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// π0.5: π0 without a state token, since the discretized state is part of the prompt, and with a time that modulates
-// every norm of the expert instead of mixing with the actions. Reference: lerobot
-// src/lerobot/policies/pi05/modeling_pi05.py (embed_prefix, embed_suffix, denoise_step).
+// π0.5: like π0, but the prompt contains the discretized state in place of a state token, and the time modulates every
+// norm of the expert. Reference: lerobot src/lerobot/policies/pi05/modeling_pi05.py (embed_prefix, embed_suffix,
+// denoise_step).
 
 #include "modules/action/gemma_expert.h"
 #include "modules/language/paligemma.h"

@@ -15,53 +15,52 @@
 
 namespace vla {
 
-/// One observation as the processor made it and the prefix graph reads it. Absent views and text padding do not
-/// appear.
+/// One observation, as the processor encodes it and the prefix reads it. It has no absent views and no text padding.
 struct PrefixInputs {
-  Tensor images;            // [width, height, 3, n_view], in the range that the image recipe makes
-  Tensor tokens;            // [n_text] i32; none where the policy reads no instruction
-  Tensor state;             // [d_state, 1], normalized and padded; none where policy.d_state is 0
-  std::uint32_t views = 0;  // bit i: view i of the bundle is among the images; 0 where only their number matters
+  Tensor images;  // [width, height, 3, n_view], in the image recipe's range
+  Tensor tokens;  // [n_text] i32; none if the policy reads no instruction
+  Tensor state;  // [d_state, 1], normalized and padded; none if policy.d_state is 0
+  std::uint32_t views = 0;  // bit i: view i of the bundle is present; 0 if only the number of views matters
 };
 
-/// The sizes of PrefixInputs. A plan is built once for each.
+/// The sizes of PrefixInputs. There is one plan for each.
 struct InputShape {
   int width = 0, height = 0, n_view = 0, n_text = 0, d_state = 0;
   std::uint32_t views = 0;  // as PrefixInputs::views
-  bool steered = false;     // the solver's steps go on from a previous chunk
+  bool steered = false;  // whether the solver continues a previous chunk
   auto operator<=>(const InputShape&) const = default;
 };
 
-/// How a reference goes on from the rows of the previous chunk that are not executed yet.
+/// How the reference continues rows of the previous chunk that are not executed yet.
 struct RealTimeChunking {
   enum class Kind { none, guided, inpainted };
   Kind kind = Kind::none;
-  double ramp_rate = 0;  // inpainted: how fast the rows after the frozen ones are set free
+  double ramp_rate = 0;  // inpainted: how fast the rows after the frozen ones become free
 };
 
-/// An architecture: which modules run in which order, at which of the three rates. It owns no loop, memory or file. The
-/// constructor declares every parameter; nothing else may fail.
+/// An architecture: which modules run, in which order and at which of the three rates. It owns no loop, memory or file.
+/// The constructor declares every parameter; nothing else can fail.
 class Policy {
  public:
   virtual ~Policy() = default;
 
-  /// Whether the network is defined on inputs of this size; checked at load. Errors: bad_bundle, unsupported.
+  /// Checks at load that the network is defined for inputs of this size. Errors: bad_bundle, unsupported.
   virtual Status check(const InputShape& shape) const = 0;
 
-  /// Load rate: everything that depends on the time alone, one column per solver step: [d, times.size()]. None where
-  /// the network knows no time.
+  /// Load rate: computes what depends on time only, one column per solver step: [d, times.size()]. None if the network
+  /// reads no time.
   virtual Tensor condition(Graph& g, std::span<const SolverTime> times) const {
     static_cast<void>(g), static_cast<void>(times);
     return {};
   }
 
-  /// Whether it matters which views are present, and not their number alone.
+  /// Whether it matters which views are present, or only how many.
   virtual bool depends_on_which_views() const { return false; }
 
   virtual RealTimeChunking real_time_chunking() const { return {}; }
 
-  /// Load rate: what depends on the weights alone, put into the cache that every prefix starts from. `absent_view`
-  /// makes a view that the robot does not have, as the image recipe does: [width, height, 3, 1].
+  /// Load rate: puts what depends on weights only into the cache that every prefix starts from. `absent_view` returns
+  /// an absent view as the image recipe makes it: [width, height, 3, 1].
   virtual void constants(Graph& g, const std::function<Tensor()>& absent_view, Cache& cache) const {
     static_cast<void>(g), static_cast<void>(absent_view), static_cast<void>(cache);
   }
@@ -73,18 +72,19 @@ class Policy {
   virtual Tensor velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const = 0;
 };
 
-/// Whether a prefix of `n_view` views of `n_token` tokens each and `n_other` other tokens is one that memory holds.
-/// Errors: unsupported.
+/// Checks that memory can hold a prefix of `n_view` views of `n_token` tokens each and `n_other` other tokens. Errors:
+/// unsupported.
 Status check_prefix(int n_view, int n_token, int n_other);
 
-/// Whether the network has places for so many views. `key` is what counts them. Errors: bad_bundle.
+/// Checks that the network has a place for each of that many views. `key` is the key that counts them. Errors:
+/// bad_bundle.
 Status check_views(const char* key, int n_view, int max_views);
 
-/// A policy that the registry knows.
+/// A registered policy.
 struct PolicyEntry {
   std::string name;
   std::unique_ptr<Policy> (*make)(ParamList& list);
-  /// The published model's keys, for manifests and for random weights of full size.
+  /// The published model's keys, for manifests and for random weights of its size.
   Keys (*published)();
 };
 
@@ -96,7 +96,7 @@ PolicyEntry policy_entry(std::string name) {
 
 /// Every architecture of src/policies/registry.inc.
 const std::vector<PolicyEntry>& policy_registry();
-/// Errors: unsupported, naming the architectures that there are.
+/// Errors: unsupported, with the list of architectures.
 Result<PolicyEntry> find_policy(const std::string& name);
 
 }  // namespace vla

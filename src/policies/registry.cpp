@@ -7,15 +7,15 @@
 
 namespace vla {
 
-// Each line of registry.inc declares the entry that src/policies/<name>.cpp defines, and puts it into the table.
+// Each line of registry.inc declares the entry that src/policies/<name>.cpp defines, and adds it to the table.
 #define POLICY(name) PolicyEntry name##_policy();
 #include "policies/registry.inc"
 #undef POLICY
 
 namespace {
 
-/// Memory of the prefix grows with the square of its tokens: 256 MB for the mask of this many, where published policies
-/// have at most about a thousand.
+/// The prefix's memory grows with the square of its tokens. The mask of this many takes 256 MB; published policies have
+/// about a thousand at most.
 constexpr int kMaxPrefix = 8192;
 
 }  // namespace

@@ -66,7 +66,7 @@ class SmolVla final : public Policy {
     const Tensor state = state_in_(g, in.state);  // [d_model, 1]
     const Tensor x =
         g.name("prefix", concat_tokens(g, {scale(g, image, image_scale_), scale(g, text, text_scale_), state}));
-    // Images and text see each other and not the state; the state sees everything.
+    // Images and text attend to each other and not to the state; the state attends to everything.
     const int groups[] = {static_cast<int>(image.dim(1) + text.dim(1)), 1};
     lm_.prefill(g, x, group_mask(g, groups), cache);
     expert_.prepare(g, cache);

@@ -1,9 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
 // TurboVLA: DINOv3 over the views and BERT over the instruction, layers in which the two attend to each other, and a
-// decoder that turns a learned query for each row of the chunk into an action. No language model, no noise: one pass.
-// Reference: lerobot_policy_turbovla modeling_turbovla.py (TurboVLA.forward), vl_interaction.py, action_decoder.py.
+// decoder that turns one learned query per chunk row into an action. No language model, no noise, one pass. Reference:
+// lerobot_policy_turbovla modeling_turbovla.py (TurboVLA.forward), vl_interaction.py, action_decoder.py.
 
 #include <fmt/format.h>
 
@@ -68,10 +67,10 @@ class TurboVla final : public Policy {
     return check_prefix(shape.n_view, vision_.n_patch(), shape.n_text + 1);
   }
 
-  /// Each camera has a row of a table.
+  /// Each camera has a row in an embedding table.
   bool depends_on_which_views() const override { return true; }
 
-  /// Computes the first layer's self-attention of the queries, which depends on nothing else.
+  /// Computes the queries' self-attention in the first layer, which is the same for every observation.
   void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {
     cache.put(g, "queries", decoder_.front().among(g, query_(g, arange(g, horizon_)), {}));
   }
@@ -96,7 +95,7 @@ class TurboVla final : public Policy {
   }
 
  private:
-  /// The state's token, where there is one, and the patches of all views, which know their place and their camera.
+  /// The state token, if any, and the patches of all views with their place and camera embeddings.
   Tensor image_tokens(Graph& g, Tensor image, const PrefixInputs& in) const {
     std::vector<std::int32_t> present;
     for (int i = 0; i < n_view_; ++i)

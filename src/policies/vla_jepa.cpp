@@ -1,9 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// VLA-JEPA: Qwen3-VL prefix whose prompt ends in embodied action tokens, a diffusion transformer that looks at those
-// alone, flow matching from noise (t = 0) to actions (t = 1). The world model (V-JEPA) learns beside the policy and is
-// not asked at inference. Reference: lerobot src/lerobot/policies/vla_jepa (modeling_vla_jepa.py, action_head.py).
+// VLA-JEPA: Qwen3-VL prefix whose prompt ends in embodied action tokens, a diffusion transformer that attends to those
+// tokens only, flow matching from noise (t = 0) to actions (t = 1). The world model (V-JEPA) is used in training only.
+// Reference: lerobot src/lerobot/policies/vla_jepa (modeling_vla_jepa.py, action_head.py).
 
 #include <fmt/format.h>
 
@@ -44,8 +43,7 @@ class VlaJepa final : public Policy {
 
   void constants(Graph& g, const std::function<Tensor()>&, Cache& cache) const override { backbone_.keep(g, cache); }
 
-  /// The prompt's last tokens are the embodied ones: in the reference's prompt text follows them, which they do not
-  /// see.
+  /// The embodied tokens end the prompt here. In the reference text follows them, which they do not see.
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
     const Tensor features = backbone_(g, in.images, in.tokens, cache);  // [d_model, n_text]
     const int n_before = static_cast<int>(features.dim(1)) - n_embodied_;

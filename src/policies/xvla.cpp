@@ -145,7 +145,7 @@ class XVla final : public Policy {
 
  private:
   int n_cell() const { return vision_.n_column() * vision_.n_row(); }
-  /// Tokens of a view: its cells behind their mean.
+  /// The tokens of a view: their mean, then its cells.
   int n_image() const { return n_cell() + 1; }
 
   /// Source: transformers modeling_florence2.py Florence2MultiModalProjector.
@@ -155,7 +155,8 @@ class XVla final : public Policy {
     return projector_norm_(g, projector_(g, concat_tokens(g, {mean(g, placed), placed})));
   }
 
-  /// The mean of each view's tokens: what a query sees to which all keys are alike. [d, n, n_view] -> [d, 1, n_view].
+  /// The mean of each view's tokens: a query of zeros attends to keys of zeros, so all values weigh the same. [d, n,
+  /// n_view] -> [d, 1, n_view].
   Tensor mean(Graph& g, Tensor x) const {
     const Shape keys = {x.dim(0) / vision_.n_head(), vision_.n_head(), x.dim(1), x.dim(2)};
     const auto zeros = [&](std::int64_t n_token) {
@@ -166,7 +167,7 @@ class XVla final : public Policy {
     return attention(g, zeros(1), {{zeros(x.dim(1)), values}}, {});
   }
 
-  /// The reference hides no padding: its tokens are seen like words (XVLAModel.forward_vlm).
+  /// The reference does not mask padding: its tokens count like words (XVLAModel.forward_vlm).
   Tensor text_tokens(Graph& g, Tensor ids) const {
     const int n_pad = n_token_ - static_cast<int>(ids.dim(0));
     const Tensor words = lm_.token().forward(g, ids);
@@ -175,8 +176,7 @@ class XVla final : public Policy {
     return concat_tokens(g, {words, lm_.token().forward(g, constant_ids(g, fmt::format("padding/{}", n_pad), pads))});
   }
 
-  /// All but the first of several. Absent ones come last, wherever they stand among the features, and are zeros where
-  /// others have features.
+  /// All views but the first. Absent ones come last, whichever they are, with zeros in place of features.
   Tensor other_views(Graph& g, Tensor image) const {
     const int n_other = static_cast<int>(image.dim(2)) - 1, n_absent = n_view_ - 1 - n_other;
     std::vector<Tensor> tokens;
@@ -185,7 +185,7 @@ class XVla final : public Policy {
     return aux_in_(g, concat_tokens(g, tokens));
   }
 
-  /// The network sees no grippers, which it predicts. Source: action_hub.py, preprocess.
+  /// The network does not see the grippers, which it predicts. Source: action_hub.py, preprocess.
   Tensor without_grippers(Graph& g, Tensor x) const {
     if (grippers_.empty()) return x;
     const std::int64_t d = x.dim(0);

@@ -12,9 +12,9 @@
 
 namespace vla {
 
-/// One layer over action tokens: attention to the context, which does not change from step to step, then a GELU MLP
-/// whose input the time is added to. Tokens do not see each other.
-/// Source: Evo-1 Evo_1/model/action_head/flow_matching.py BasicTransformerBlock.
+/// One layer over action tokens: cross-attention to the context, which is the same in every step, then a GELU MLP whose
+/// input has the time added. Tokens do not attend to each other. Source: Evo-1 Evo_1/model/action_head/flow_matching.py
+/// BasicTransformerBlock.
 class CrossBlock : public Module<CrossBlock> {
  public:
   CrossBlock(const Scope& s, int d_model, int d_ff, int n_head, float eps);
@@ -35,13 +35,13 @@ class CrossHead {
  public:
   CrossHead(const Scope& s, int d_model);
 
-  /// Load rate: puts the keys and values of rows that every observation may need.
+  /// Load rate: keeps the keys and values of rows that any observation may need.
   void keep(Graph& g, Tensor rows, Cache& cache) const;
-  /// `count` of the rows that `keep` got, from `first` on, each repeated `copies` times.
+  /// `count` of the rows passed to `keep`, starting at `first`, each repeated `copies` times.
   struct Kept {
     int first, count, copies;
   };
-  /// Observation rate: puts keys and values of the context [d_model, n] and of kept rows behind it.
+  /// Observation rate: caches keys and values of the context [d_model, n], followed by kept rows.
   void prepare(Graph& g, Tensor context, std::span<const Kept> kept, int n_query, Cache& cache) const;
   /// Step rate: x [d_model, n_query] -> the same shape, normalized.
   Tensor operator()(Graph& g, Tensor x, Tensor time, const Cache& cache) const;

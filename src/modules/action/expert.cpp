@@ -32,12 +32,12 @@ ExpertCrossBlock::ExpertCrossBlock(const Scope& s, int d_model, int d_ff, const 
       mlp_(s, d_model, d_ff, Activation::silu) {}
 
 void ExpertCrossBlock::prepare(Graph& g, const KeyValue& prefix, Cache& cache) const {
-  // The cached keys already carry their rotation, and the reference projects them as they are.
+  // Projects the cached keys as they are, with their rotation, as the reference does.
   put(g, cache, path(), attention_.project()(g, merge_heads(g, prefix.key), merge_heads(g, prefix.value), {}));
 }
 
 Tensor ExpertCrossBlock::forward(Graph& g, Tensor x, const Cache& cache) const {
-  // Positions of a cross layer's queries start at 0, not behind the prefix: forward_cross_attn_layer subtracts their
+  // Positions of a cross layer's queries start at 0, not after the prefix: forward_cross_attn_layer subtracts their
   // minimum.
   const Tensor rotary = attention_.heads().rotary(g, 0, static_cast<int>(x.dim(1)));
   x = add(g, x, attention_(g, attn_norm_(g, x), rotary, {get(g, cache, path())}));

@@ -9,7 +9,8 @@
 
 namespace vla {
 
-/// An expert layer whose actions see the prefix through the language model's keys and values, and each other causally.
+/// An expert layer with self-attention: actions attend to the language model's cached keys and values, and causally to
+/// each other.
 class ExpertSelfBlock : public Module<ExpertSelfBlock> {
  public:
   ExpertSelfBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
@@ -23,7 +24,8 @@ class ExpertSelfBlock : public Module<ExpertSelfBlock> {
   GatedMlp mlp_;
 };
 
-/// An expert layer whose actions see only the prefix, through keys and values projected once more.
+/// An expert layer with cross-attention: actions attend to the prefix only, through keys and values that this layer
+/// projects again.
 class ExpertCrossBlock : public Module<ExpertCrossBlock> {
  public:
   ExpertCrossBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
@@ -39,14 +41,14 @@ class ExpertCrossBlock : public Module<ExpertCrossBlock> {
   GatedMlp mlp_;
 };
 
-/// The action expert beside a language model: a narrower decoder whose layer i attends to what layer i of the language
-/// model left in the cache. `<path>.layer_kinds` says for each of them whether the expert's layer is self or cross
-/// attention, or missing. Source: lerobot policies/smolvla/smolvlm_with_expert.py.
+/// SmolVLA's action expert: a narrower decoder whose layer i attends to the cached layer i of the language model.
+/// `<path>.layer_kinds` says for each of these layers whether the expert's is self-attention, cross-attention or
+/// missing. Source: lerobot policies/smolvla/smolvlm_with_expert.py.
 class Expert {
  public:
   Expert(const Scope& s, const Decoder& lm);
 
-  /// Observation rate: whatever depends on the prefix alone.
+  /// Observation rate: computes what depends on the prefix only.
   void prepare(Graph& g, Cache& cache) const;
   /// Step rate. x [d_model, horizon] -> the same shape, after the final norm.
   Tensor operator()(Graph& g, Tensor x, const Cache& cache) const;

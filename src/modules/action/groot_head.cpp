@@ -40,7 +40,7 @@ GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
   if (family.future_tokens) future_.emplace(s / "future", dit_.d_model(), n_future_);
   if (family.mixing) {
     const Scope vl = s / "vl";
-    const int n_layer = vl.index("n_layer", 513), n_head = vl.dim("n_head", 1024);  // a model may do without layers
+    const int n_layer = vl.index("n_layer", 513), n_head = vl.dim("n_head", 1024);  // a model may have no such layers
     for (int i = 0; i < n_layer; ++i)
       vl_blocks_.emplace_back(vl / "blk" / i, d_context, n_head, vl.dim("d_ff"), vl.number("norm_eps", kNormEps));
     vl.require(n_layer == 0 || d_context % n_head == 0, "n_head", fmt::format("a divisor of lm.d_model {}", d_context),
@@ -55,7 +55,7 @@ GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
 }
 
 Tensor GrootHead::condition(Graph& g, std::span<const SolverTime> times) const {
-  // The reference makes an integer of the time in double.
+  // The reference discretizes the time in double.
   std::vector<float> buckets;
   for (const SolverTime& time : times) buckets.push_back(static_cast<float>(std::trunc(time.exact * n_bucket_)));
   const auto embedded = [&](int d, TimeWaves waves) {

@@ -13,15 +13,15 @@
 
 namespace vla {
 
-/// How the heads of the releases differ.
+/// What differs between the heads of the releases.
 struct GrootFamily {
-  bool state_rows;     // the state is `policy.n_state_row` rows, one for each moment, and each becomes a token
-  bool future_tokens;  // `policy.n_future` learned tokens between the state's and those of the actions
-  bool mixing;         // `vl.n_layer` layers of self-attention over the features
-  bool alternating;    // even layers look at the text or at the images (`dit.attend_text_every_n_blocks`), else at all
+  bool state_rows;  // the state has `policy.n_state_row` rows, one per moment; each becomes a token
+  bool future_tokens;  // `policy.n_future` learned tokens between the state and the actions
+  bool mixing;  // `vl.n_layer` layers of self-attention over the context
+  bool alternating;  // even layers attend to text or images in turn (`dit.attend_text_every_n_blocks`), else to both
                        // rows
-  bool norm = true;    // features are normalized and mixed by `context`, else they pass as they are
-  bool may_lack_state = false;  // `policy.d_state` may be 0, and then no token is the state's
+  bool norm = true;  // `context` normalizes and mixes the features, else it returns them
+  bool may_lack_state = false;  // `policy.d_state` may be 0: then there is no state token
 };
 
 /// The action head of GR00T: self-attention over the features, a diffusion transformer over tokens of state and
@@ -34,13 +34,14 @@ class GrootHead {
   /// `s` is the root of the tree; `d_context`: width of the features.
   GrootHead(const Scope& s, int d_context, GrootFamily family);
 
-  /// Load rate: modulations of all norms and the actions' time, one column per time.
+  /// Load rate: the modulations of all norms and the embedded time of the actions, one column per time.
   Tensor condition(Graph& g, std::span<const SolverTime> times) const;
   /// Observation rate: features [d_context, n] -> the same shape, normalized and mixed.
   Tensor context(Graph& g, Tensor features) const;
-  /// Observation rate: keys and values of the context's rows, and the tokens that stand before those of the actions.
+  /// Observation rate: caches keys and values of the context, and the tokens before those of the actions.
   void prepare(Graph& g, Tensor text, Tensor image, Tensor state, Cache& cache) const;
-  /// Step rate: x_t [d_action, horizon] -> the velocity, the same shape. `condition` is one column of the above.
+  /// Step rate: x_t [d_action, horizon] -> the velocity, the same shape. `condition` is one column of the load rate's
+  /// table.
   Tensor velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const;
 
  private:

@@ -21,8 +21,8 @@ class MlpResNetBlock : public Module<MlpResNetBlock> {
   Linear linear_;
 };
 
-/// An action head that reads rows of a language model's features at once: no time, no noise. Rows of a chunk do not see
-/// each other. Source: BitVLA openvla-oft prismatic/models/action_heads.py MLPResNet.
+/// An action head of one pass over rows of a language model's features, without time or noise. Rows of a chunk do not
+/// interact. Source: BitVLA openvla-oft prismatic/models/action_heads.py MLPResNet.
 class MlpResNet {
  public:
   MlpResNet(const Scope& s, int d_in, int d_hidden, int d_out);

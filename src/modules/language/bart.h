@@ -9,8 +9,8 @@
 
 namespace vla {
 
-/// BART's encoder, over embedded tokens of any kind: all see each other, norms are behind the sums, positions are
-/// learned. Source: transformers modeling_bart.py BartEncoder.
+/// BART's encoder over embedded tokens: full self-attention, post-norm, learned positions. Source: transformers
+/// modeling_bart.py BartEncoder.
 class BartEncoder {
  public:
   explicit BartEncoder(const Scope& s);

@@ -6,8 +6,8 @@
 
 namespace vla {
 
-/// BERT over one sentence: BART's encoder over tokens to each of which the sentence's row is added. Its pooler is not
-/// part of it. Source: transformers modeling_bert.py BertModel.
+/// BERT over one sentence: BART's encoder over tokens plus the embedding of the first sentence. The pooler is left out.
+/// Source: transformers modeling_bert.py BertModel.
 class Bert {
  public:
   explicit Bert(const Scope& s);
@@ -21,7 +21,7 @@ class Bert {
 
  private:
   BartEncoder encoder_;
-  const Param* sentence_;  // the row of the first of two sentences
+  const Param* sentence_;  // the embedding of the first of two sentences
 };
 
 }  // namespace vla

@@ -11,17 +11,17 @@
 
 namespace vla {
 
-/// How the families of decoders differ, as their references compute them.
+/// What differs between families of decoders, as their references compute it.
 struct DecoderFamily {
-  Activation activation;  // of the gated MLP
+  Activation activation;  // activation of the gated MLP
   RotaryAngle rope_angle;
 };
-/// SmolVLA's own rotation beside a Llama; Gemma as transformers has it.
+/// SmolVLA's own rotation on a Llama; Gemma as in transformers.
 constexpr DecoderFamily kSmolLm = {Activation::silu, RotaryAngle::quotient};
 constexpr DecoderFamily kGemma = {Activation::gelu_tanh, RotaryAngle::product};
 
-/// One pre-norm layer of the language model; it leaves its keys and values in the cache.
-/// Source: lerobot policies/smolvla/smolvlm_with_expert.py forward, forward_attn_layer.
+/// One pre-norm layer of the language model; it puts its keys and values into the cache. Source: lerobot
+/// policies/smolvla/smolvlm_with_expert.py forward, forward_attn_layer.
 class DecoderBlock : public Module<DecoderBlock> {
  public:
   DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps);
@@ -35,15 +35,15 @@ class DecoderBlock : public Module<DecoderBlock> {
   GatedMlp mlp_;
 };
 
-/// A language model of the Llama or Gemma family as a policy uses it: it embeds tokens and turns a prefix into keys and
-/// values, layer by layer. Nothing reads the last layer's output, so that layer stops at its keys and values.
+/// A language model of the Llama or Gemma family as a policy uses it: it embeds tokens and computes keys and values of
+/// a prefix, layer by layer. The last layer's output is not read, so that layer stops at its keys and values.
 class Decoder {
  public:
   Decoder(const Scope& s, DecoderFamily family);
 
   /// tokens [n] i32 -> [d_model, n], not scaled.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_(g, tokens); }
-  /// x [d_model, n], mask [n, n] or none where all see all -> cache `<path>.blk.<i>.{k,v}`, each [d_head, n_head_kv,
+  /// x [d_model, n], mask [n, n] or none for full attention -> cache `<path>.blk.<i>.{k,v}`, each [d_head, n_head_kv,
   /// n].
   void prefill(Graph& g, Tensor x, Tensor mask, Cache& cache) const;
 

@@ -13,7 +13,7 @@ PaliGemma::PaliGemma(const Scope& s)
       text_scale_(s.number("text_scale", kTokenScale)) {}
 
 void PaliGemma::prefill(Graph& g, Tensor images, Tensor tokens, Cache& cache) const {
-  // Only embedding rows are scaled: Gemma was trained with sqrt(d_model) on them, and the projector without.
+  // Scales only the embedded text: Gemma was trained with sqrt(d_model) on embeddings, the projector without it.
   const Tensor view = projector_(g, vision_(g, images));  // [d_model, n_token, n_view]
   g.end_stage("vision");
   const Tensor image = flatten_views(g, view);                      // [d_model, n_token * n_view]

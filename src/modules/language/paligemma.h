@@ -7,27 +7,27 @@
 
 namespace vla {
 
-/// PaliGemma as the π family uses it: a SigLIP tower, a linear projector, and a Gemma that turns images and text into
-/// keys and values. Reads `vision.*`, `projector.*`, `lm.*` and `policy.text_scale`. Source: lerobot
+/// PaliGemma as the π family uses it: a SigLIP tower, a linear projector, and a Gemma that computes keys and values of
+/// images and text. Reads `vision.*`, `projector.*`, `lm.*` and `policy.text_scale`. Source: lerobot
 /// policies/pi0/modeling_pi0.py embed_prefix.
 class PaliGemma {
  public:
   /// `s` is the root of the tree.
   explicit PaliGemma(const Scope& s);
 
-  /// Whether images of this size are those of the tower. Errors: bad_bundle, unsupported.
+  /// Checks that images have the tower's size. Errors: bad_bundle, unsupported.
   Status check(int width, int height) const { return vision_.check(width, height); }
   /// Tokens of one view.
   int n_token(int width) const { return (width / vision_.patch_size()) * (width / vision_.patch_size()); }
   /// images [width, height, 3, n_view], tokens [n_text] i32 -> cache `lm.blk.<i>.{k,v}` of n_view * n_token + n_text
-  /// tokens, all of which see each other. Absent views and padding are masked in the reference and do not advance
-  /// positions, so leaving them out changes nothing.
+  /// tokens with full attention. The reference masks absent views and padding, which do not advance positions, so
+  /// leaving them out changes nothing.
   void prefill(Graph& g, Tensor images, Tensor tokens, Cache& cache) const;
 
   const Decoder& lm() const { return lm_; }
 
-  /// The published size, PaliGemma 3B at 224 pixels, beside a policy's own keys. Source: transformers PaliGemmaConfig,
-  /// lerobot get_gemma_config.
+  /// The keys of the published size, PaliGemma 3B at 224 pixels, added to a policy's own. Source: transformers
+  /// PaliGemmaConfig, lerobot get_gemma_config.
   static Keys published(std::map<std::string, Value, std::less<>> policy);
 
  private:

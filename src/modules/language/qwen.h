@@ -11,14 +11,14 @@
 
 namespace vla {
 
-/// How the generations differ, and where features are read.
+/// What differs between generations, and where features are read.
 struct QwenFamily {
-  Bias bias;                                 // of queries, keys and values
-  bool head_norms;                           // queries and keys are normalized head by head
-  bool final_norm;                           // features are read behind it, else they are what the last layer gives
-  Activation activation = Activation::silu;  // of the gated MLP
+  Bias bias;  // biases of queries, keys and values
+  bool head_norms;  // norms of queries and keys over each head
+  bool final_norm;  // features are read after the final norm, else after the last layer
+  Activation activation = Activation::silu;  // activation of the gated MLP
   Rule rule = Rule::floats;
-  bool sub_norms = false;  // both output products have an RMS norm in front
+  bool sub_norms = false;  // RMS norm before both output projections
 };
 constexpr QwenFamily kQwen2 = {Bias::yes, false, true};
 constexpr QwenFamily kQwen3 = {Bias::no, true, true};
@@ -34,7 +34,7 @@ class QwenBlock : public Module<QwenBlock> {
   /// x [d_model, n], rotary [d_head, n], mask [n, n] or none -> the shape of x. `added` [d_model, n], or none, is added
   /// to the layer's result.
   Tensor forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Tensor added = {}) const;
-  /// The same where attention adds nothing: a token for itself.
+  /// The same without attention: every token passes the MLP only.
   Tensor alone(Graph& g, Tensor x) const;
 
  private:
@@ -44,26 +44,25 @@ class QwenBlock : public Module<QwenBlock> {
   GatedMlp mlp_;
 };
 
-/// Qwen as a policy uses it: it embeds tokens and turns a sequence into features.
-/// Sources: transformers modeling_qwen2.py Qwen2Model, modeling_qwen3.py Qwen3Model, modeling_qwen3_vl.py
-/// Qwen3VLTextModel.
+/// Qwen as a policy uses it: it embeds tokens and computes features of a sequence. Sources: transformers
+/// modeling_qwen2.py Qwen2Model, modeling_qwen3.py Qwen3Model, modeling_qwen3_vl.py Qwen3VLTextModel.
 class Qwen {
  public:
   Qwen(const Scope& s, QwenFamily family);
 
-  /// tokens [n] i32 -> [d_model, n]. A prompt is embedded piece by piece, so the pieces are no taps.
+  /// tokens [n] i32 -> [d_model, n]. A prompt is embedded in pieces, which have no taps.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_.forward(g, tokens); }
-  /// The same with views [d_model, n_view_token, n_view] at their places, whatever the ids there.
+  /// The same with views [d_model, n_view_token, n_view] at their places, whose ids are ignored.
   Tensor embed(Graph& g, Tensor tokens, Tensor views, const ViewPlaces& places) const;
-  /// x [d_model, n] of tokens at 0 to n - 1, each of which sees those before it -> features [d_model, n].
+  /// x [d_model, n] at positions 0 to n - 1, causal -> features [d_model, n].
   Tensor operator()(Graph& g, Tensor x) const;
-  /// The same for tokens at `positions`, mask [n, n].
+  /// The same for given positions and mask [n, n].
   Tensor operator()(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const;
-  /// The same where every token sees all.
+  /// The same with full attention.
   Tensor bidirectional(Graph& g, Tensor x) const;
-  /// The same for tokens that turn by a table [d_head, n]; `added[i]` [d_model, n] is added to the result of layer i.
+  /// The same, rotated by a table [d_head, n]; `added[i]` [d_model, n] is added to the result of layer i.
   Tensor operator()(Graph& g, Tensor x, Tensor rotary, Tensor mask, const std::vector<Tensor>& added) const;
-  /// Features of tokens whose attention is cut out of every layer: [d_model, n] -> the same shape.
+  /// Features of tokens without attention in any layer: [d_model, n] -> the same shape.
   Tensor alone(Graph& g, Tensor x) const;
 
   int d_model() const { return d_model_; }

@@ -13,15 +13,14 @@
 
 namespace vla {
 
-/// mRoPE position ids of a prompt's tokens: those of an image of n_row x n_column tokens, which starts at each of
-/// `view_starts`, share a time and count rows and columns from it; text counts on behind the farthest of them. Source:
-/// transformers modeling_qwen3_vl.py Qwen3VLModel.get_rope_index.
+/// mRoPE position ids of a prompt. An image of n_row x n_column tokens begins at each of `view_starts`: its tokens
+/// share a time, and rows and columns count from it. Text continues after the largest id so far. Source: transformers
+/// modeling_qwen3_vl.py Qwen3VLModel.get_rope_index.
 std::vector<PositionId> mrope_position_ids(std::span<const int> view_starts, int n_row, int n_column, int n_token);
 
-/// Qwen3-VL as a policy uses it: images and text become the features of one sequence. The first layers of the
-/// language model get what inner layers of the tower saw, added to the tokens of the images (DeepStack).
-/// Reads `vision.*`, `connector.*`, `deepstack.*`, `lm.*` and the places of the views.
-/// Source: the same file, Qwen3VLModel.
+/// Qwen3-VL as a policy uses it: images and text become the features of one sequence. Features of inner tower layers
+/// are added to the image tokens in the first layers of the language model (DeepStack). Reads `vision.*`,
+/// `connector.*`, `deepstack.*`, `lm.*` and the places of the views. Source: the same file, Qwen3VLModel.
 class Qwen3Vl {
  public:
   /// `s` is the root of the tree.
@@ -29,9 +28,9 @@ class Qwen3Vl {
 
   /// Errors: bad_bundle, unsupported.
   Status check(int width, int height, int n_view, int n_token) const;
-  /// Load rate: what depends on the weights alone.
+  /// Load rate: computes what depends on weights only.
   void keep(Graph& g, Cache& cache) const { vision_.keep(g, cache); }
-  /// images [width, height, 3, max_views], tokens [n] i32 with any ids where images stand -> features [d_model, n].
+  /// images [width, height, 3, max_views], tokens [n] i32, ignored at the images' places -> features [d_model, n].
   Tensor operator()(Graph& g, Tensor images, Tensor tokens, const Cache& cache) const;
 
   const ViewPlaces& places() const { return places_; }

@@ -17,7 +17,7 @@ ViewPlaces::ViewPlaces(const Scope& s, int n_view_token, Count count)
   bool apart = max_views() == s.dim("max_views", 32);
   for (const int n : counts_) apart = apart && n > 0;
   if (apart) {
-    // Text sees text: the first token is no image's.
+    // The first token belongs to no view: text must have a token to attend to.
     min_tokens_ = back ? 1 + counts_.front() : counts_.back() + n_view_token_;
     int end = 1;
     for (const int start : starts(min_tokens_)) {

@@ -10,30 +10,31 @@
 
 namespace vla {
 
-/// A stretch of a prompt: text, or the image tokens of one view.
+/// A piece of a prompt: text, or the image tokens of one view.
 struct PromptPiece {
   static constexpr int kText = -1;
   int first, count;
   int slot;  // the view's number, or kText
 };
 
-/// The places of the views among the tokens of a prompt: `policy.max_views` of them, in order. Where the instruction
-/// follows them, `policy.view_starts` counts from the first token; where it stands before them,
-/// `policy.view_starts_from_end` counts back from the end.
+/// The places of the views among a prompt's tokens: `policy.max_views` of them, in order. If the instruction follows
+/// the views, `policy.view_starts` counts from the first token; if it precedes them, `policy.view_starts_from_end`
+/// counts back from the end.
 class ViewPlaces {
  public:
   enum class Count { from_start, from_end };
   /// `s` is the root of the tree; `n_view_token`: image tokens of a view.
   ViewPlaces(const Scope& s, int n_view_token, Count count = Count::from_start);
 
-  /// Whether a prompt of `n_token` tokens has a place for each of `n_view` views and no other. Errors: bad_bundle.
+  /// Checks that a prompt of `n_token` tokens has a place for each of `n_view` views and no other. Errors: bad_bundle.
   Status check(int n_view, int n_token) const;
-  /// Text and views in the order of the prompt; no piece is empty.
+  /// Text and views in the prompt's order; no piece is empty.
   std::vector<PromptPiece> pieces(int n_token) const;
 
-  /// Views [d, n_view_token, max_views] at their places among the rows [d, count] that `text` makes: [d, n_token].
+  /// Inserts views [d, n_view_token, max_views] at their places between the rows [d, count] that `text` returns: [d,
+  /// n_token].
   Tensor arrange(Graph& g, Tensor views, int n_token, const std::function<Tensor(const PromptPiece&)>& text) const;
-  /// The rows of the views, and all others.
+  /// Indices of the views' rows, and of all other rows.
   struct Rows {
     Tensor image, text;
   };
@@ -49,7 +50,7 @@ class ViewPlaces {
  private:
   int n_view_token_, min_tokens_ = 1;
   Count count_;
-  std::vector<int> counts_;  // as the key has them
+  std::vector<int> counts_;  // as stored in the key
 };
 
 }  // namespace vla

@@ -14,7 +14,7 @@ namespace {
 
 constexpr int kMaxStage = 8;
 
-/// Cells of a map as tokens and back: [d, n_column, n_row, n_view], [d, n, n_view].
+/// Reshapes a map of cells to tokens and back: [d, n_column, n_row, n_view], [d, n, n_view].
 Tensor as_tokens(Graph& g, Tensor x) { return g.add(op::Reshape{}, {x}, {x.dim(0), x.dim(1) * x.dim(2), x.dim(3), 1}); }
 Tensor shaped_like(Graph& g, Tensor x, Tensor like) { return g.add(op::Reshape{}, {x}, like.shape()); }
 

@@ -10,33 +10,33 @@
 
 namespace vla {
 
-/// A map of cells that is cut into windows of size x size cells from the upper left. Beyond the map the reference puts
-/// zeros in front of the attention's products, so that those cells are keys and values too, all with the same ones:
-/// the biases. One key with the logarithm of their count in the mask stands for all of a window's.
+/// Cuts a map of cells into windows of size x size cells, from the upper left. The reference pads the map with zeros
+/// before the projections of attention, so padding cells are keys and values too, all equal to the biases. One key with
+/// the logarithm of their count in the mask stands for all of a window's padding cells.
 class Windows {
  public:
   Windows(int n_column, int n_row, int size);
 
-  /// Windows that hold as many cells of the map as each other.
+  /// Windows with the same number of cells of the map.
   struct Kind {
     int n_cell;             // of one window
-    int n_beyond;           // cells beyond the map
-    std::vector<int> cell;  // of all of them, window by window: row * n_column + column
+    int n_beyond;  // padding cells in a window
+    std::vector<int> cell;  // cells of all these windows in order: row * n_column + column
   };
   const std::vector<Kind>& kinds() const { return kinds_; }
   bool reach_beyond() const;
-  /// x [d, n, n_view] -> [d, n * n_view], tokens by kind, view and window.
+  /// x [d, n, n_view] -> [d, n * n_view], tokens ordered by kind, view and window.
   Tensor cut(Graph& g, Tensor x) const;
   /// The way back.
   Tensor join(Graph& g, Tensor x, Tensor like) const;
 
  private:
-  std::vector<std::int32_t> order(int n_view) const;  // where each token of `cut` comes from
+  std::vector<std::int32_t> order(int n_view) const;  // the index in x of each token of `cut`
   int n_column_, n_row_, size_;
   std::vector<Kind> kinds_;
 };
 
-/// Queries, keys and values of one product each, and the product behind attention, with biases.
+/// One projection for queries, keys and values, and the output projection, with biases.
 struct AttentionProducts {
   AttentionProducts(const Scope& s, int d_model);
   Linear q, k, v, out;
@@ -48,12 +48,12 @@ struct DavitStage {
   float norm_eps;
 };
 
-/// The blocks' common part: x + conv(x), attention, x + conv(x), MLP. Source: transformers modeling_florence2.py
-/// Florence2VisionSpatialBlock, Florence2VisionChannelBlock.
+/// What both kinds of blocks share: x + conv(x), attention, x + conv(x), MLP. Source: transformers
+/// modeling_florence2.py Florence2VisionSpatialBlock, Florence2VisionChannelBlock.
 class DavitBlock {
  public:
   DavitBlock(const Scope& s, const DavitStage& stage);
-  /// x [d_model, n_column, n_row, n_view] -> the same shape; `attend` has normed tokens [d_model, n, n_view].
+  /// x [d_model, n_column, n_row, n_view] -> the same shape; `attend` gets normalized tokens [d_model, n, n_view].
   template <class Attend>
   Tensor operator()(Graph& g, Tensor x, const Attend& attend) const;
 
@@ -70,7 +70,7 @@ class SpatialBlock : public Module<SpatialBlock> {
  public:
   SpatialBlock(const Scope& s, const DavitStage& stage);
   Tensor forward(Graph& g, Tensor x, const Cache& cache) const;
-  /// Load rate: key and value of a cell beyond the map.
+  /// Load rate: key and value of a padding cell.
   void keep(Graph& g, Cache& cache) const;
 
  private:
@@ -93,8 +93,7 @@ class ChannelBlock : public Module<ChannelBlock> {
   AttentionProducts products_;
 };
 
-/// A convolution that makes the map smaller, with a norm in front of it or behind.
-/// Source: Florence2VisionConvEmbed.
+/// A strided convolution that shrinks the map, with a norm before or after it. Source: Florence2VisionConvEmbed.
 class ConvEmbed : public Module<ConvEmbed> {
  public:
   ConvEmbed(const Scope& s, int d_in, int d_out, int size, int stride, bool pre_norm, float eps);
@@ -106,22 +105,22 @@ class ConvEmbed : public Module<ConvEmbed> {
   Convolution convolution_;
 };
 
-/// DaViT: stages of spatial and channel blocks in turn. Source: transformers modeling_florence2.py
+/// DaViT: stages of alternating spatial and channel blocks. Source: transformers modeling_florence2.py
 /// Florence2VisionBackbone.
 class Davit {
  public:
-  /// Reads the lists d_model, n_layer, n_head, n_group, d_ff, patch_size, patch_stride and pre_norm, a number for each
-  /// stage, and window, image_width, image_height and norm_eps.
+  /// Reads the lists d_model, n_layer, n_head, n_group, d_ff, patch_size, patch_stride and pre_norm, with one number
+  /// per stage, and window, image_width, image_height and norm_eps.
   explicit Davit(const Scope& s);
 
   /// images [width, height, 3, n_view], standardized -> [d_model, n_column, n_row, n_view].
   Tensor operator()(Graph& g, Tensor images, const Cache& cache) const;
   /// Load rate.
   void keep(Graph& g, Cache& cache) const;
-  /// Images have one size. Errors: unsupported.
+  /// Checks that images have the size of the keys. Errors: unsupported.
   Status check(int width, int height) const;
 
-  int d_model() const { return d_model_; }  // of the last stage
+  int d_model() const { return d_model_; }  // channels of the last stage
   int n_head() const { return n_head_; }
   int n_column() const { return n_column_; }
   int n_row() const { return n_row_; }

@@ -10,16 +10,16 @@
 
 namespace vla {
 
-/// The vision transformers of DINOv3, every view in one batch. A class token and registers precede the patches and are
-/// dropped at the end; patches know their place by turning, and those tokens do not turn.
-/// Source: transformers modeling_dinov3_vit.py DINOv3ViTModel.
+/// DINOv3's vision transformer, all views in one batch. A class token and registers precede the patches and are dropped
+/// at the end; only patches get a rotary embedding of their place. Source: transformers modeling_dinov3_vit.py
+/// DINOv3ViTModel.
 class DinoV3 {
  public:
   explicit DinoV3(const Scope& s);
 
   /// images [side, side, 3, n_view], standardized -> [d_model, n_patch, n_view]. `check` must have accepted the size.
   Tensor operator()(Graph& g, Tensor images) const;
-  /// Images have one size. Errors: unsupported.
+  /// Checks that images have the size of the keys. Errors: unsupported.
   Status check(int width, int height) const;
 
   int d_model() const { return d_model_; }

@@ -18,13 +18,13 @@ class InternVit {
 
   /// images [side, side, 3, n_view], standardized -> [d_model, n_patch, n_view]. `check` must have accepted the size.
   Tensor operator()(Graph& g, Tensor images) const;
-  /// Images have the size of the position table: what the reference makes of it for others is not implemented.
+  /// Checks that images fit the position table; the reference's interpolation for other sizes is not implemented.
   /// Errors: unsupported.
   Status check(int width, int height) const;
 
   int d_model() const { return d_model_; }
   int image_size() const { return image_size_; }
-  /// Patches in a row of the image.
+  /// Patches per image row.
   int n_side() const { return n_side_; }
 
  private:

@@ -12,7 +12,7 @@
 namespace vla {
 namespace {
 
-/// The place of patch i of n between two neighbours on a side of the table.
+/// The position of patch i of n between two neighbours along one side of the table.
 struct Stretch {
   int below, above;
   float fraction;
@@ -26,7 +26,7 @@ Stretch stretch(int i, int n, int n_side) {
   return {below, std::min(below + 1, n_side - 1), at - static_cast<float>(below)};
 }
 
-/// Neighbours on a side of the table that a patch sums.
+/// How many neighbours along one side of the table a patch sums.
 struct Window {
   int first;
   std::vector<float> weights;

@@ -7,11 +7,11 @@
 
 namespace vla {
 
-/// Consecutive patches as one token of the language model's width, through a norm and a GELU MLP.
-/// Source: transformers modeling_qwen3_vl.py Qwen3VLVisionPatchMerger.
+/// Merges consecutive patches into one token of the language model's width, through a norm and a GELU MLP. Source:
+/// transformers modeling_qwen3_vl.py Qwen3VLVisionPatchMerger.
 class PatchMerger : public Module<PatchMerger> {
  public:
-  /// `count` patches of width `d_vision` are a token; the norm sees them one by one, or the token.
+  /// Merges `count` patches of width `d_vision`. The norm is applied to each patch or to the merged token.
   enum class Norm { patch, token };
   PatchMerger(const Scope& s, Norm norm, int d_vision, int count, int d_model, float eps);
   /// x [d_vision, n, n_view] -> [d_model, n / count, n_view].

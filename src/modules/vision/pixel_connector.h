@@ -13,9 +13,9 @@ class PixelConnector : public Module<PixelConnector> {
   PixelConnector(const Scope& s, int d_vision, int d_model);
   /// x [d_vision, side^2, n_view] -> [d_model, (side / factor)^2, n_view]. `check` must have accepted the side.
   Tensor forward(Graph& g, Tensor x) const;
-  /// Whether a grid of `side` x `side` patches can be divided. Errors: unsupported.
+  /// Checks that a grid of `side` x `side` patches can be divided. Errors: unsupported.
   Status check(int side) const;
-  /// Tokens that a grid of `side` x `side` patches becomes.
+  /// How many tokens a grid of `side` x `side` patches becomes.
   int n_token(int side) const { return (side / factor_) * (side / factor_); }
 
  private:

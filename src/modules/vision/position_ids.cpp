@@ -12,9 +12,9 @@
 namespace vla {
 namespace {
 
-/// torch.arange(1/n, 1, 1/n) in float32. Vectors of `width` elements start at a rounded multiple and count on from
-/// there in double; they come in pairs, and what is left over is made one by one. So the last bits depend on the
-/// machine: 8 with AVX2 and AVX-512, 4 with NEON, 1 without vectors.
+/// torch.arange(1/n, 1, 1/n) in float32. torch computes vectors of `width` elements: each starts at a rounded multiple
+/// and continues in double; vectors come in pairs, and the remainder is computed one by one. The last bits therefore
+/// depend on the machine's width: 8 with AVX2 and AVX-512, 4 with NEON, 1 without vectors.
 std::vector<float> boundaries(int n_table, int width) {
   const double step = 1.0 / n_table;
   const int count = static_cast<int>(std::ceil((1.0 - step) / step));
@@ -34,7 +34,7 @@ float round_to_bfloat16(float x) {
   return std::bit_cast<float>((bits + 0x7fff + ((bits >> 16) & 1)) & 0xffff0000u);
 }
 
-/// The fraction of the image at which patch i of n lies, in the arithmetic of the rule.
+/// The position of patch i of n as a fraction of the image, in the rule's arithmetic.
 float fraction(const std::string& rule, int i, int n) {
   if (rule == "bucketize_shifted")
     return static_cast<float>(i) / static_cast<float>(n) * static_cast<float>(1.0 - 1e-6);
@@ -42,7 +42,7 @@ float fraction(const std::string& rule, int i, int n) {
   return rule == "bucketize_bfloat16" ? round_to_bfloat16(exact) : exact;
 }
 
-/// torch.bucketize(right=True): how many boundaries are not above the fraction.
+/// torch.bucketize(right=True): the number of boundaries that are at most the fraction.
 std::vector<std::int32_t> axis_ids(const std::string& rule, int n_grid, const std::vector<float>& edges) {
   std::vector<std::int32_t> ids;
   for (int i = 0; i < n_grid; ++i)

@@ -12,25 +12,24 @@
 
 namespace vla {
 
-/// The vision tower of Qwen3-VL on single images, every view in one batch. An image is treated as two frames that are
-/// the same, and each has a patch product of its own. Patches come in squares of merge x merge, one square after the
-/// other; they know their place by a learned table and by turning. There is no final norm.
-/// Source: transformers modeling_qwen3_vl.py Qwen3VLVisionModel.
+/// Qwen3-VL's vision tower on single images, all views in one batch. An image counts as two equal frames with a patch
+/// projection each. Patches are ordered in squares of merge x merge; their places enter by a learned table and by
+/// rotary embedding. There is no final norm. Source: transformers modeling_qwen3_vl.py Qwen3VLVisionModel.
 class QwenVit {
  public:
   explicit QwenVit(const Scope& s);
 
-  /// Load rate: the position table stretched over the image, into the cache.
+  /// Load rate: interpolates the position table for the image size into the cache.
   void keep(Graph& g, Cache& cache) const;
-  /// images [width, height, 3, n_view] in [-1, 1] -> what each of `deepstack_layers` and then the last layer gives,
+  /// images [width, height, 3, n_view] in [-1, 1] -> the results of `deepstack_layers` and then of the last layer,
   /// [d_model, n_patch, n_view] each.
   std::vector<Tensor> operator()(Graph& g, Tensor images, const Cache& cache) const;
-  /// Images have one size. Errors: unsupported.
+  /// Checks that images have the size of the keys. Errors: unsupported.
   Status check(int width, int height) const;
 
   int d_model() const { return d_model_; }
   float norm_eps() const { return norm_eps_; }
-  /// Patches that become one token.
+  /// How many patches become one token.
   int n_merged() const { return merge_ * merge_; }
   /// Tokens of a view: rows and columns.
   int n_token_row() const { return n_row_ / merge_; }

@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// Two 3 x 3 convolutions beside a shortcut, which is a 1 x 1 convolution where width or size change:
+/// Two 3 x 3 convolutions and a shortcut, which is a 1 x 1 convolution if width or size change:
 /// relu(conv2(relu(conv1(x))) + shortcut(x)). x [d_in, width, height, n_view] -> [d_out, n_column, n_row, n_view].
 /// Source: torchvision models/resnet.py BasicBlock.
 class ResNetBlock : public Module<ResNetBlock> {
@@ -22,18 +22,18 @@ class ResNetBlock : public Module<ResNetBlock> {
   std::optional<Convolution> shortcut_;
 };
 
-/// ResNet-18 and -34 up to their last feature map. Batch norms are frozen and part of the weights, as vla-convert makes
-/// them. Source: torchvision models/resnet.py ResNet, without avgpool and fc.
+/// ResNet-18 and -34 up to their last feature map. vla-convert folds the frozen batch norms into the weights. Source:
+/// torchvision models/resnet.py ResNet, without avgpool and fc.
 class ResNet {
  public:
   /// Reads `n_block`, the blocks of each of the four stages, and `image_width` and `image_height`.
   explicit ResNet(const Scope& s);
-  /// Errors: unsupported, where images have another size: the network was trained with one.
+  /// Checks that images have the size that the network was trained with. Errors: unsupported.
   Status check(int width, int height) const;
-  static constexpr int kWidth = 512;  // of the last stage
+  static constexpr int kWidth = 512;  // channels of the last stage
   int d_model() const { return kWidth; }
-  /// Cells of the last feature map along a side of so many pixels: the window of the first convolution and of the
-  /// pooling, and the first of three stages, go in steps of two.
+  /// Cells of the last feature map along a side of that many pixels. The first convolution, the pooling and the first
+  /// block of three stages have a stride of two.
   static int n_cell(int n_pixel) { return (n_pixel + 31) / 32; }
   /// images [width, height, 3, n_view] -> [d_model, n_column, n_row, n_view].
   Tensor operator()(Graph& g, Tensor images) const;

@@ -15,12 +15,12 @@ namespace vla {
 /// SmolVLMVisionTransformer.
 class Siglip {
  public:
-  /// `post_norm`: features are read behind a last norm, else they are what the last layer gives.
+  /// `post_norm`: features are read after a final norm, else after the last layer.
   explicit Siglip(const Scope& s, EncoderFamily family = kPlainEncoder, bool post_norm = true);
 
   /// images [width, height, 3, n_view] in [-1, 1] -> [d_model, n_patch, n_view]. `check` must have accepted the size.
   Tensor operator()(Graph& g, Tensor images) const;
-  /// Whether images of this size have defined patches and positions. Errors: bad_bundle, unsupported.
+  /// Checks that patches and positions are defined for images of this size. Errors: bad_bundle, unsupported.
   Status check(int width, int height) const;
 
   int d_model() const { return d_model_; }

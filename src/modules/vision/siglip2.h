@@ -16,11 +16,11 @@ class Siglip2 {
  public:
   explicit Siglip2(const Scope& s);
 
-  /// Load rate: the resized position table, into the cache.
+  /// Load rate: resizes the position table into the cache.
   void keep(Graph& g, Cache& cache) const;
   /// images [width, height, 3, n_view] in [-1, 1] -> [d_model, n_patch, n_view], patches row by row.
   Tensor operator()(Graph& g, Tensor images, const Cache& cache) const;
-  /// Images have one size. Errors: unsupported.
+  /// Checks that images have the size of the keys. Errors: unsupported.
   Status check(int width, int height) const;
 
   int d_model() const { return d_model_; }
