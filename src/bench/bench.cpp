@@ -16,7 +16,7 @@ Result<RandomBundle> make_random(const Request& request, const Watcher& watcher)
   return RandomBundle::make(request.arch, entry.published(), random_sizes(request));
 }
 
-/// Before the machine is measured, which takes seconds. Errors: those of Bundle::open.
+/// Checks the bundle before measuring the machine, which takes seconds. Errors: those of Bundle::open.
 Status check_bundle(const std::string& path) {
   const Result<Bundle> found = Bundle::open(path);
   return found ? Status() : Status(found.error());
@@ -39,7 +39,7 @@ Conditions conditions_of(const Engine& engine, const Workload& workload, int n_s
           .device = engine.device().name()};
 }
 
-/// Rounds of every number of steps.
+/// Runs the rounds of every number of steps.
 Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const std::vector<int>& steps,
                                     const Request& request, const Watcher& watcher) {
   std::vector<Series> all;

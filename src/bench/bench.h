@@ -7,24 +7,24 @@
 
 namespace vla::bench {
 
-/// A measurement to make, and how often.
+/// What to measure, and how often.
 struct Request {
-  std::string bundle;  // a file; empty: random weights
-  std::string arch;    // of the random weights, at their published size
+  std::string bundle;  // path of a bundle; empty: random weights
+  std::string arch;  // architecture of the random weights, at its published size
   DType dtype = DType::bf16;
   WorkloadSizes sizes;
-  std::vector<int> steps;  // the report is of the last, and has a fit where there are several; empty: the bundle's own
+  std::vector<int> steps;  // the report is of the last one; with several it has a fit; empty: the bundle's own
   int n_round = 7, n_warmup = 1;
-  int n_thread = 0;  // as EngineOptions has them
+  int n_thread = 0;  // as in EngineOptions
   std::string kernels, device, embodiment;
   std::size_t memory = 0;
 };
 
-/// The sizes of the random weights that stand in for a bundle.
+/// The sizes of a bundle of random weights.
 RandomSizes random_sizes(const Request& request);
 
-/// Measures the machine, then the policy, then the machine again. `accept` sees the conditions before the first round
-/// and may refuse them. Errors: usage, out_of_memory, and those of Engine.
+/// Measures the machine, the policy, and the machine again. `accept` gets the conditions before the first round and may
+/// refuse them. Errors: usage, out_of_memory, and those of Engine.
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
                        const Watcher& watcher);
 

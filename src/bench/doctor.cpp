@@ -15,7 +15,7 @@
 namespace vla::bench {
 namespace {
 
-constexpr double kFewMs = 250;  // an act that is so short may be faster on one thread
+constexpr double kFewMs = 250;  // a shorter act may be faster on one thread
 
 std::string content(const char* path) {
   std::ifstream in(path);
@@ -35,7 +35,7 @@ double median_cores(const Report& report) {
   return quantile(cores, 0.5);
 }
 
-/// Milliseconds of a stage, or of all of them as `network`; 0 without a prediction.
+/// Predicted milliseconds of a stage, or of all as `network`; 0 without a prediction.
 double predicted_ms(const StagePredictions& stages, const std::string& name) {
   double seconds = 0;
   for (const auto& [stage, prediction] : stages)

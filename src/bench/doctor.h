@@ -6,54 +6,53 @@
 
 namespace vla::bench {
 
-/// A machine's resources for a policy, and its load.
+/// What a machine offers a policy, and how busy it is.
 struct Machine {
   std::string cpu;
-  int n_core = 0;                    // that this process may use
-  std::vector<std::string> kernels;  // as --kernels names them, the best last
-  Roofs roofs;                       // of all these cores
-  std::size_t free_memory = 0;       // bytes that a process could take, under the limit of its group too
-  std::string governor;              // of the first core's frequency; empty where the system does not tell
-  double load = 0;                   // running or waiting threads of the last minute, on the mean
+  int n_core = 0;  // cores that this process may use
+  std::vector<std::string> kernels;  // as --kernels names them, best last
+  Roofs roofs;  // peak of all these cores
+  std::size_t free_memory = 0;  // bytes that a process may allocate, also under its control group's limit
+  std::string governor;  // frequency governor of the first core; empty if unknown
+  double load = 0;  // load average of the last minute
 };
 
-/// Takes a second or two, in which the machine should do nothing else. Errors: device.
+/// Measures for a second or two; the machine should be idle. Errors: device.
 Result<Machine> examine_machine();
 
-/// Bytes that a process could take: what the system has available, or less where a control group limits it.
-/// `meminfo`, `limit` and `used` are the texts of /proc/meminfo and of the group's two files; empty where there is
-/// none.
+/// Bytes that a process may allocate: the system's available memory, or less under a control group's limit. `meminfo`,
+/// `limit` and `used` are the contents of /proc/meminfo and of the group's two files; empty if missing.
 std::size_t free_memory(const std::string& meminfo, const std::string& limit, const std::string& used);
 
-/// A stage of the network as it should be here, and as it was.
+/// A stage of the network: predicted and measured.
 struct StageCheck {
   std::string name;
   double predicted = 0, measured = 0;  // ms; 0: no prediction for this device
 };
 
-/// A policy on this machine. Times are milliseconds, medians of the rounds.
+/// A policy on this machine. Times are medians of the rounds, in milliseconds.
 struct Checkup {
-  Report report;                   // with every core
+  Report report;  // with all cores
   std::vector<StageCheck> stages;  // of the network; then "network"
-  double host = 0;                 // before and after the network: images, text, actions
+  double host = 0;  // work of the host: images, text, actions
   double total = 0;
-  double cores = 0;                  // that the rounds had
-  double one_thread = 0;             // the total with one thread; 0 where that was not measured
+  double cores = 0;  // cores that the rounds really had
+  double one_thread = 0;  // total on one thread; 0 if not measured
   int horizon = 0;                   // rows of a chunk
-  double rate_hz = 0;                // rows a second; 0 where the bundle does not state it
+  double rate_hz = 0;  // rows per second; 0 if the bundle does not state it
   std::size_t predicted_memory = 0;  // bytes
 
-  /// The fewer threads where they are faster: small networks are.
+  /// The faster number of threads: small networks are faster on one.
   double best() const { return one_thread > 0 ? std::min(one_thread, total) : total; }
-  /// Rows that the robot executes while the next chunk is computed: it cannot replan more often.
+  /// Rows that the robot executes while the next chunk is computed, which is the shortest replan interval.
   int replan_rows() const;
-  /// Whether a chunk lasts until the next one is there. True where no rate is stated.
+  /// Whether a chunk lasts until the next one arrives. True if no rate is stated.
   bool holds_rate() const { return rate_hz == 0 || replan_rows() <= horizon; }
 };
 
-/// Predicts from one phase of each kind (Engine::predict), loads the bundle and measures a few acts; on one thread
-/// too where an act takes less than a quarter of a second. Errors: out_of_memory, before anything is loaded, where it
-/// would not fit; those of `measure`.
+/// Predicts from one phase of each kind (Engine::predict), then loads the bundle and measures a few acts, also on one
+/// thread if an act takes less than a quarter of a second. Errors: out_of_memory, before loading, if the policy would
+/// not fit; those of `measure`.
 Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, const Watcher& watcher);
 
 }  // namespace vla::bench

@@ -15,7 +15,7 @@
 namespace vla::bench {
 namespace {
 
-/// The text after `key` and a colon in a file of /proc, or nothing.
+/// The value of `key` in a file of /proc, or empty.
 std::string proc_line(const char* file, const std::string& key) {
   std::ifstream in(file);
   for (std::string line; std::getline(in, line);) {

@@ -9,7 +9,7 @@
 
 namespace vla::bench {
 
-/// The limits of this machine, measured: multiply-adds by instruction set, and reading memory beyond the caches.
+/// Measured limits of this machine: multiply-adds by instruction set, and memory bandwidth beyond the caches.
 struct Roofs {
   struct Peak {
     std::string name;
@@ -18,27 +18,28 @@ struct Roofs {
   std::vector<Peak> peaks;
   double bandwidth = 0;  // bytes per second, all threads
 
-  /// The rate of all threads under this name.
+  /// The rate of all threads for the probe of this name.
   double peak(const std::string& name) const;
 };
 
-/// Takes a second or less. The machine should do nothing else.
+/// Measures for a second or less; the machine should be idle.
 Roofs measure_roofs(int n_thread);
 
-/// As the system names it; of ARM64 its cores, of which it says the part numbers only: "4 Cortex-A55, 4 Cortex-A76".
+/// The processor's name as the system gives it. ARM64 systems give part numbers only, so its cores are listed: "4
+/// Cortex-A55, 4 Cortex-A76".
 std::string cpu_name();
-/// The cores that /proc/cpuinfo lists by ARM's part numbers, in its order; empty where it lists none.
+/// The cores that /proc/cpuinfo lists by ARM part number, in order; empty if it lists none.
 std::string arm_cores(std::istream& cpuinfo);
 
-/// Seconds that all threads of this process have run.
+/// Processor time of all threads of this process, in seconds.
 double cpu_seconds();
 
-/// Memory of this process as the system counts it, in bytes; 0 where it does not say.
+/// Resident memory of this process in bytes; 0 if the system does not tell.
 struct ProcessMemory {
   std::size_t peak = 0, now = 0;
 };
 ProcessMemory process_memory();
-/// Resets the peak. False where the system does not allow it.
+/// Resets the peak. False if the system refuses.
 bool forget_peak_memory();
 
 }  // namespace vla::bench

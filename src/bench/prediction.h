@@ -8,7 +8,7 @@
 
 namespace vla::bench {
 
-/// The time of an act as a model of a GPU predicts it, stage by stage, from counts and published rates. Nothing runs.
+/// The time of an act as a model of a GPU predicts it, by stage, from counted work and published rates. Nothing runs.
 struct GpuPrediction {
   std::string policy, device, linear_kernels;
   int n_view = 0, n_text = 0, n_step = 0;
@@ -19,11 +19,11 @@ struct GpuPrediction {
   Program::Prediction total() const;
 };
 
-/// Predicts for the request's bundle, or zeros in the place of random weights; a request has no threads or rounds here.
-/// Errors: usage, and those of Engine::load.
+/// Predicts for the request's bundle, or for random weights; threads and rounds of the request are not used. Errors:
+/// usage, and those of Engine::load.
 Result<GpuPrediction> predict(const Request& request, const std::string& model);
 
-/// For display, and as one JSON object on one line.
+/// Text for display, and one JSON object on one line.
 std::string to_text(const GpuPrediction& prediction);
 std::string to_json(const GpuPrediction& prediction);
 

@@ -18,7 +18,7 @@
 namespace vla::bench {
 namespace {
 
-constexpr int kRobot = 7;  // joints of the robot that the features describe
+constexpr int kRobot = 7;  // joints of the robot in the features
 
 std::vector<std::string> numbered(const std::string& name, int count) {
   std::vector<std::string> names;
@@ -26,9 +26,9 @@ std::vector<std::string> numbered(const std::string& name, int count) {
   return names;
 }
 
-/// Places for views in front of the text or behind it, for a network that has them among its tokens.
+/// Where a prompt has the views' tokens, for networks that read them among text.
 struct ViewPlaces {
-  int count = 0;   // none: the network takes images beside the text
+  int count = 0;  // none: the network takes images separately
   int repeat = 0;  // tokens of a view
   bool behind = false;
 
@@ -36,7 +36,7 @@ struct ViewPlaces {
 
   static constexpr std::string_view kOpen = "View {i}: ", kToken = "<view>", kClose = "\n";
 
-  /// Every byte is a token, and there are fewer than ten places: `{i}` is one token.
+  /// Every byte is a token and there are at most nine places, so `{i}` is one token.
   int open_size() const { return static_cast<int>(kOpen.size()) - 2; }
   int size() const { return open_size() + repeat + static_cast<int>(kClose.size()); }
   std::vector<std::int64_t> starts() const {
@@ -91,7 +91,7 @@ std::string recipe(const ImageSize& image, const ViewPlaces& places, int max_tok
                       {"close", places.kClose},
                       {"place", places.behind ? "back" : "front"}};
   const Json tokenize = {{"op", "tokenize"}, {"max_tokens", max_tokens}, {"truncate", "right"}};
-  // A network without a state vector sees none: what a robot sends is dropped.
+  // A network without a state vector drops the state that a robot sends.
   const Json state = d_state > 0 ? Json::object({{"op", "pad"}, {"size", d_state}}) : Json::object({{"op", "drop"}});
   const Json take = {{"op", "take"}, {"size", d_robot}};
   Json root;
@@ -104,8 +104,8 @@ std::string recipe(const ImageSize& image, const ViewPlaces& places, int max_tok
   return root.dump();
 }
 
-/// The byte-level alphabet in any order, and no merges: every byte of a text is a token. It is Latin-1 without what
-/// cannot be printed, which moves to U+0100 and after.
+/// The byte-level alphabet without merges, so that every byte of a text is a token: Latin-1, with unprintable
+/// characters moved to U+0100 and after.
 std::vector<std::string> byte_tokens() {
   std::vector<std::string> tokens;
   for (unsigned code = '!'; code < 0x100 + 68; ++code) {
@@ -118,7 +118,7 @@ std::vector<std::string> byte_tokens() {
   return tokens;
 }
 
-/// A token beside those of bytes, found anywhere in a text.
+/// An added token, found anywhere in a text.
 std::string added_token(std::string_view content, std::size_t id) {
   const nlohmann::ordered_json token = {{"id", id},        {"content", content}, {"single_word", false},
                                         {"lstrip", false}, {"rstrip", false},    {"normalized", false},
@@ -186,8 +186,8 @@ std::uint64_t next_random(std::uint64_t& state) {
   return z ^ (z >> 31);
 }
 
-/// The same value in 16 bits, cut off. Exact enough for random values of ordinary size; what f16 has no normal
-/// number for becomes zero.
+/// Truncates the value to 16 bits. This is exact enough for random values of ordinary size; values below f16's normal
+/// range become zero.
 std::uint16_t to_16_bits(float value, DType type) {
   std::uint32_t bits;
   std::memcpy(&bits, &value, sizeof(bits));
@@ -197,8 +197,7 @@ std::uint16_t to_16_bits(float value, DType type) {
   return static_cast<std::uint16_t>((bits >> 16 & 0x8000) | (exponent - 112) << 10 | (bits >> 13 & 0x3FF));
 }
 
-/// The bytes of `count` elements, evenly drawn from -0.04 to 0.04: rows of any length keep the size of what they
-/// multiply.
+/// The bytes of `count` elements, uniform in [-0.04, 0.04]: products of any depth keep the magnitude of their input.
 std::string random_bytes(std::size_t count, DType type, std::uint64_t seed) {
   const std::size_t size = dtype_size(type, 1);
   std::string bytes(count * size, '\0');
@@ -218,8 +217,8 @@ std::string random_codes(std::size_t count, std::uint64_t seed) {
   return bytes;
 }
 
-/// The values of tensors: random ones for matrices and tables; ones for the weights of norms and zeros
-/// for biases, so that elements stay finite through any depth.
+/// Values of tensors: random for matrices and tables, ones for norm weights, zeros for biases, so that values stay
+/// finite at any depth.
 class Values {
  public:
   Values(const ParamList& list, const RandomSizes& sizes) {
@@ -232,7 +231,7 @@ class Values {
     zeros_.assign(ones_.size(), '\0');
   }
 
-  /// Calls `use` with the bytes of `param`, in pieces.
+  /// Calls `use` with the bytes of `param`, part by part.
   template <class Use>
   void each_piece(const Param& param, std::size_t size, Use use) const {
     const std::string& source = !is_float(param.encoding.type)     ? codes_
@@ -244,9 +243,9 @@ class Values {
   }
 
  private:
-  static constexpr std::size_t kPool = std::size_t{1} << 22;  // elements that are drawn before they repeat
+  static constexpr std::size_t kPool = std::size_t{1} << 22;  // random elements before they repeat
 
-  /// A kernel is that of a convolution whose result is added to what it reads.
+  /// A vector named `kernel` is that of a depthwise convolution, whose result is added to its input.
   static bool is_added(const Param& param) { return param.name.ends_with("bias") || param.name.ends_with("kernel"); }
   static std::size_t longest_vector(const ParamList& list) {
     std::int64_t longest = 1;

@@ -11,16 +11,17 @@ namespace vla::bench {
 
 struct RandomSizes {
   int n_view = 2, max_tokens = 48, n_step = 10;
-  DType dtype = DType::bf16;  // of matrices and tables
+  DType dtype = DType::bf16;  // dtype of matrices and tables
   std::uint64_t seed = 0;
-  bool is_filled = true;  // else weights are zeros that take no memory
+  bool is_filled = true;  // else weights read as zeros and take no memory
 };
 
-/// A valid bundle of random weights in memory: what a network of that size costs, without a checkpoint. Nothing is
-/// written to a disk; the memory goes with the object. The values repeat after some millions, which no product notices.
+/// A valid bundle of random weights in memory, to measure a network of that size without a checkpoint. Nothing is
+/// written to disk, and the memory is freed with the object. Values repeat after some millions, which does not change a
+/// product's time.
 class RandomBundle {
  public:
-  /// `network` has the keys that the architecture declares, such as PolicyEntry::published; features, recipe, solver
+  /// `network` has the keys that the architecture declares, such as PolicyEntry::published. Features, recipe, solver
   /// and a vocabulary of single bytes are added. Errors: unsupported, bad_bundle, out_of_memory.
   static Result<RandomBundle> make(const std::string& arch, const Keys& network, const RandomSizes& sizes);
 
@@ -28,7 +29,7 @@ class RandomBundle {
   RandomBundle& operator=(RandomBundle&&) = delete;
   ~RandomBundle();
 
-  /// A name under which this process can open it.
+  /// A path by which this process can open it.
   std::string path() const { return "/proc/self/fd/" + std::to_string(file_); }
 
  private:

@@ -17,20 +17,20 @@ double median_of(const std::vector<Round>& rounds, double Round::*value) {
   return quantile(values, 0.5);
 }
 
-/// Seconds of arithmetic at these rates.
+/// Seconds that the arithmetic takes at these rates.
 double time_at(const Work& work, double peak, double int8_peak) {
   return (work.flop - work.int8) / peak + work.int8 / (int8_peak > 0 ? int8_peak : peak);
 }
 
-/// One row from the times and the work of each round.
+/// One row from the times and work of every round.
 StageRow make_row(const std::string& name, const std::vector<double>& times, const Work& work, const Report& report) {
   StageRow row{
       .name = name, .p50 = quantile(times, 0.5), .p90 = quantile(times, 0.9), .min = quantile(times, 0), .work = work};
   if (row.p50 <= 0) return row;
   row.flop_rate = work.flop / (1e-3 * row.p50);
   row.byte_rate = work.bytes / (1e-3 * row.p50);
-  if (!report.conditions.on_cpu()) return row;  // the probes measure the CPU
-  // A probe that something disturbed would flatter its round: no round's peak counts for less than their median.
+  if (!report.conditions.on_cpu()) return row;  // the probes measure the CPU only
+  // A disturbed probe would flatter its round, so no round's peak counts less than the median.
   const double min_peak = median_of(report.rounds, &Round::peak),
                min_int8_peak = median_of(report.rounds, &Round::int8_peak);
   std::vector<double> shares;

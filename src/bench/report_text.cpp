@@ -20,7 +20,7 @@ std::vector<std::string> cells(const StageRow& row, const Report& report) {
     cells.back() = "host";
     return cells;
   }
-  // The probes measure the CPU, and say nothing of another device.
+  // The probes measure the CPU only.
   const auto on_cpu = [&](std::string cell) { return report.conditions.on_cpu() ? std::move(cell) : std::string(); };
   for (std::string cell :
        {on_cpu(fmt::format("{:.2f}", row.floor)), on_cpu(fmt::format("{:.2f} x", row.above_floor())),
@@ -85,7 +85,7 @@ std::vector<std::string> around(const Report& report) {
   return lines;
 }
 
-/// The line that most readers came for.
+/// The summary line.
 std::string headline(const Report& report) {
   const StageRow* total = report.find("total");
   if (total == nullptr || total->p50 <= 0) return "";

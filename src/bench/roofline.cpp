@@ -10,9 +10,9 @@
 namespace vla::bench {
 namespace {
 
-/// The image and the plot in it, in pixels.
+/// Sizes of the image and of the plot in it, in pixels.
 constexpr double kWidth = 1000, kHeight = 640, kLeft = 84, kRight = 690, kTop = 84, kBottom = 566;
-/// Colours that stay apart for colour-blind readers. Source: Okabe and Ito, Color Universal Design.
+/// Colours that colour-blind readers can tell apart. Source: Okabe and Ito, Color Universal Design.
 constexpr const char* kColours[] = {"#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"};
 
 std::string escape(const std::string& text) {
@@ -30,7 +30,7 @@ std::string escape(const std::string& text) {
   return safe;
 }
 
-/// A logarithmic axis from `low` to `high`, drawn from pixel `begin` to pixel `end`.
+/// A logarithmic axis from `low` to `high`, drawn between pixels `begin` and `end`.
 struct Axis {
   double low, high, begin, end;
   double at(double value) const {
@@ -58,7 +58,7 @@ class Drawing {
     for (const Roofs::Peak& peak : report.before.peaks) y_high = std::max(y_high, report.peak(peak.name));
     x_ = {x_low / 6, x_high * 6, kLeft, kRight};
     y_ = {y_low / 4, y_high * 2.2, kBottom, kTop};
-    for (const StageRow* row : rows_) {  // nothing is written over a point
+    for (const StageRow* row : rows_) {  // keeps texts off the points
       const double x = x_.at(row->intensity()), y = y_.at(row->flop_rate);
       taken_.push_back({x - 8, y - 8, x + 8, y + 8});
     }
@@ -118,7 +118,7 @@ class Drawing {
     text(24, middle, "GFLOP per second", fmt::format("text-anchor=\"middle\" transform=\"rotate(-90 24 {})\"", middle));
   }
 
-  /// A roof over all intensities at which memory is fast enough for it, with its name above or below.
+  /// A horizontal roof over all intensities at which memory is fast enough, with its name above or below.
   void flat_roof(double rate, const std::string& label, const std::string& style) {
     const double left = std::max(x_.at(std::max(rate / report_.bandwidth(), x_.low)), kLeft), y = y_.at(rate);
     line(left, y, kRight, y, style);
@@ -140,7 +140,7 @@ class Drawing {
     slope();
   }
 
-  /// Draws the limit of memory: bytes per second times operations per byte, up to the highest roof.
+  /// Draws the memory limit: bandwidth times operations per byte, up to the highest roof.
   void slope() {
     double highest = report_.peak();
     for (const Roofs::Peak& peak : report_.before.peaks) highest = std::max(highest, report_.peak(peak.name));
@@ -154,7 +154,7 @@ class Drawing {
          fmt::format("text-anchor=\"middle\" transform=\"rotate({:.1f} {:.1f} {:.1f})\"", angle, x, y));
   }
 
-  /// The first of several places around (x, y) for a text of this width that meets nothing placed before.
+  /// The first of several places around (x, y) where a text of this width overlaps nothing placed before.
   Box place(double x, double y, double width, std::initializer_list<std::pair<double, double>> offsets) {
     Box box = {};
     for (const auto& [dx, dy] : offsets) {
@@ -181,7 +181,8 @@ class Drawing {
       svg_ += fmt::format(
           "<circle cx=\"{:.1f}\" cy=\"{:.1f}\" r=\"7\" fill=\"{}\" stroke=\"white\" stroke-width=\"1.5\"/>\n", x, y,
           colour(i));
-      for (const char* style : {"stroke=\"white\" stroke-width=\"4\"", "fill=\"#111\""})  // a rim, then the letters
+      // an outline, then the letters
+      for (const char* style : {"stroke=\"white\" stroke-width=\"4\"", "fill=\"#111\""})
         text(label.left, label.bottom - 3, rows_[i]->name, std::string("font-weight=\"bold\" ") + style);
     }
   }

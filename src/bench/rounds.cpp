@@ -28,7 +28,7 @@ Result<Round> run_round(Engine& engine, Workload& workload) {
   return round;
 }
 
-/// The network's share of a round, without the host's work before and after it.
+/// The network's time in a round, without the host's work before and after.
 double network_time(const Round& round, const StageWork& work) {
   double time = 0;
   for (const auto& [stage, ms] : round.stages)

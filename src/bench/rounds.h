@@ -21,16 +21,16 @@ struct Round {
   double total() const;  // ms
 };
 
-/// Rounds of one number of solver steps.
+/// Rounds with one number of solver steps.
 struct Series {
   int n_step = 0;
-  std::string peak_name, int8_peak_name;  // of the probes between the rounds
+  std::string peak_name, int8_peak_name;  // highest probe between the rounds
   std::vector<Round> rounds;
-  StageWork work;                                     // of the network's stages
-  std::vector<std::pair<std::string, double>> times;  // of the last round before the measured ones: Device::times
+  StageWork work;  // work of the network's stages
+  std::vector<std::pair<std::string, double>> times;  // Device::times of the last round before the measured ones
 };
 
-/// Observes a run: gets its messages, and is called before each round, which it may delay or refuse.
+/// Observes a run: receives its messages, and is called before each round, which it may delay or refuse.
 struct Watcher {
   std::function<void(const std::string& line)> tell;
   std::function<Status()> before_round;
@@ -40,16 +40,16 @@ struct Watcher {
 /// counted. Errors: those of Engine::act.
 Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher);
 
-/// total(T) = prefix + T * step, fitted by least squares to the median times of the network alone. In ms.
+/// total(T) = prefix + T * step, in ms, fitted by least squares to the network's median times.
 struct StepFit {
   double prefix = 0, step = 0;
-  double worst = 0;  // largest distance of a measured median from the line
+  double worst = 0;  // largest distance of a median from the line
   std::vector<std::pair<int, double>> points;
 };
-/// Needs series of two different numbers of steps.
+/// Needs series with two different numbers of steps.
 StepFit fit_steps(const std::vector<Series>& series);
 
-/// The value that a part `share` of the values does not exceed, between neighbours linearly; NumPy's default.
+/// The q-quantile for q = `share`, linearly interpolated (NumPy's default).
 double quantile(std::vector<double> values, double share);
 /// Milliseconds of one stage in every round.
 std::vector<double> stage_times(const Series& series, const std::string& stage);

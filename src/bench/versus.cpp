@@ -15,7 +15,7 @@ namespace {
 constexpr std::size_t kMaxFile = std::size_t{64} << 20;
 constexpr double kSamePeak = 0.05;
 
-/// The report is the last line of what the program printed.
+/// The report is the last line of the program's output.
 std::string last_line(std::span<const std::byte> bytes) {
   std::string text(reinterpret_cast<const char*>(bytes.data()), bytes.size());
   while (!text.empty() && (text.back() == '\n' || text.back() == '\r')) text.pop_back();
@@ -34,7 +34,7 @@ Result<Earlier> Earlier::read(const std::string& path) {
   using Json = nlohmann::ordered_json;
   Earlier earlier;
   earlier.path_ = path;
-  try {  // the library throws where something is missing or of another type
+  try {  // nlohmann::json throws if a key is missing or has another type
     const Json root = Json::parse(last_line(bytes));
     const Json& c = root.at("conditions");
     earlier.conditions_ = {c.at("policy"),     c.at("weights"),    c.at("source"),          c.at("views"),

@@ -8,15 +8,15 @@
 
 namespace vla::bench {
 
-/// An earlier report, read from the JSON that `to_json` wrote, to be compared with.
+/// An earlier report to compare with, parsed from the output of `to_json`.
 class Earlier {
  public:
-  /// Errors: io, usage (not such a report).
+  /// Errors: io, usage (not a report).
   static Result<Earlier> read(const std::string& path);
 
-  /// Times can only be compared of the same work. Errors: usage, naming what differs.
+  /// Checks that both reports measured the same work. Errors: usage, naming what differs.
   Status check(const Conditions& now) const;
-  /// Earlier time over present time, stage by stage, with a warning where the machine itself was another.
+  /// Earlier time over present time for each stage, with a warning if the machine's peaks differ.
   std::string compare(const Report& now) const;
 
  private:

@@ -12,7 +12,7 @@
 namespace vla::bench {
 namespace {
 
-/// An image that compresses like a camera's: smooth shapes under the noise of a sensor.
+/// An image that compresses like a camera's: smooth shapes with sensor noise.
 std::vector<std::uint8_t> draw_frame(int width, int height, std::uint32_t seed) {
   std::vector<std::uint8_t> rgb;
   rgb.reserve(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3);
@@ -42,15 +42,16 @@ Result<std::vector<std::byte>> write_png(const std::vector<std::uint8_t>& rgb, i
 
 Result<int> count_tokens(const Processor& processor, const Observation& observation) {
   Inputs inputs;
-  VLA_CHECK(processor.encode_state(observation, inputs));  // which a prompt may tell
+  VLA_CHECK(processor.encode_state(observation, inputs));  // a prompt may include the state
   VLA_CHECK(processor.encode_text(observation, inputs));
   return static_cast<int>(inputs.tokens.size()) - processor.n_view_tokens();
 }
 
-/// Tokens that the places for views leave for the instruction.
+/// Tokens left for the instruction beside the views.
 int most_text(const Processor& processor) { return processor.recipe().max_tokens - processor.n_view_tokens(); }
 
-/// A text of exactly `n_token` tokens: the same word again and again, for a few words that tokenizers cut differently.
+/// A text of exactly `n_token` tokens: one word repeated. Several words are tried, since tokenizers split them
+/// differently.
 Result<std::string> find_text(const Processor& processor, Observation observation, int n_token) {
   if (n_token == 0 && most_text(processor) == 0) return std::string();
   const int most = most_text(processor);
@@ -63,7 +64,7 @@ Result<std::string> find_text(const Processor& processor, Observation observatio
     for (int i = 0; i < n_token; ++i) {
       text += word;
       const auto count = count_tokens(processor, observation);
-      if (!count || *count > n_token) break;  // a vocabulary need not have this word
+      if (!count || *count > n_token) break;  // not every vocabulary has this word
       if (*count == n_token) return text;
     }
   }

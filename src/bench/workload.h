@@ -10,18 +10,18 @@
 
 namespace vla::bench {
 
-/// The sizes of observations to send; one that is not given is as large as the bundle allows.
+/// The sizes of observations. A size that is not given is the largest that the bundle allows.
 struct WorkloadSizes {
   std::optional<int> n_view;
-  int width = 0, height = 0;  // of the raw frames; 0: what the recipe makes of them
-  std::optional<int> n_text;  // tokens of the instruction
+  int width = 0, height = 0;  // size of the raw frames; 0: the size after the recipe
+  std::optional<int> n_text;  // tokens in the instruction
 };
 
-/// One observation that costs what a real one of these sizes costs: frames as PNG files in memory, a state, and an
-/// instruction of exactly so many tokens.
+/// One observation that costs as much as a real one of these sizes: frames as PNG files in memory, a state, and an
+/// instruction of exactly that many tokens.
 class Workload {
  public:
-  /// Errors: usage, where the bundle cannot take such an observation.
+  /// Errors: usage, if the bundle cannot take such an observation.
   static Result<Workload> make(const Processor& processor, const WorkloadSizes& sizes);
 
   /// Decodes the frames again, as a program would that receives files.

@@ -11,7 +11,7 @@
 
 namespace vla::capi {
 
-/// The result of `vla_describe`, with the memory that its pointers point into; therefore it stays where it was made.
+/// The result of `vla_describe` and the memory that its pointers refer to. It must not be moved.
 class Description {
  public:
   /// One robot, or several.
@@ -32,7 +32,7 @@ class Description {
   const char* const* keep_names(const std::vector<vla::Description::Number>& numbers);
   const char* const* keep_units(const std::vector<vla::Description::Number>& numbers);
 
-  // Filled once, in the constructor; pointers into a deque stay valid while it grows.
+  // Filled once, in the constructor; a deque keeps pointers to its elements valid while it grows.
   std::deque<std::string> kept_;
   std::deque<Texts> texts_;
   std::vector<vla_view_info> view_infos_;

@@ -13,7 +13,7 @@
 
 namespace {
 
-/// ggml keeps its own instance to itself.
+/// ggml does not export its own instance.
 std::string driver(ggml_backend_dev_t device) {
   std::string text = "driver unknown";
   const VkApplicationInfo application = {.sType = VK_STRUCTURE_TYPE_APPLICATION_INFO, .apiVersion = VK_API_VERSION_1_2};

@@ -11,8 +11,8 @@
 #include <cstring>
 #include <initializer_list>
 
-/// The environment as ggml reads it. Settings that change results are ours: products are computed in float32.
-/// Without them shaders round operands to float16 wherever the device has it.
+/// Replaces the environment that ggml reads. Settings that change results are fixed here: products are computed in
+/// float32. By default ggml's shaders round operands to float16 where the device has it.
 inline char* vla_vulkan_setting(const char* name) {
   static char yes[] = "1";
   for (const char* ours : {"GGML_VK_DISABLE_F16", "GGML_VK_DISABLE_BFLOAT16", "GGML_VK_DISABLE_COOPMAT",
@@ -22,8 +22,8 @@ inline char* vla_vulkan_setting(const char* name) {
 }
 #define getenv(name) vla_vulkan_setting(name)
 
-// Settings of the debugging layer came with headers 1.3.272. ggml names their types in code that a release never runs:
-// here they have the layout of the extension and set nothing.
+// Debug-layer settings exist since headers 1.3.272. ggml names their types in code that a release build never runs.
+// Here they have the extension's layout and set nothing.
 #ifndef VK_EXT_LAYER_SETTINGS_EXTENSION_NAME
 namespace vk {
 enum class LayerSettingTypeEXT : int { eBool32 };

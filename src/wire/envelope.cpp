@@ -29,7 +29,8 @@ Kind kind_of(int number) {
   }
 }
 
-/// A request of another version may have fields that are unknown here; it is refused for its version, not for them.
+/// A request of another version may have fields that this version does not know. It is refused for its version, not for
+/// the fields.
 Status read_request(std::span<const std::byte> request, Envelope& envelope) {
   std::optional<Error> unknown;
   for (Fields field(request, "request");;) {

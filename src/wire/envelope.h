@@ -19,7 +19,7 @@ constexpr const char* kind_name(Kind kind) {
   return kNames[static_cast<int>(kind)];
 }
 
-/// The class of a code on the wire, which is an exit code; internal for a number that stands for none.
+/// The error class of a code on the wire; `internal` for an unknown number.
 constexpr Code code_of(int number) {
   const bool is_known = number >= exit_code(Code::internal) && number <= exit_code(Code::shutting_down);
   return is_known ? static_cast<Code>(number - exit_code(Code::internal)) : Code::internal;
@@ -28,27 +28,26 @@ constexpr Code code_of(int number) {
 /// The protocol versions that this build speaks.
 constexpr std::uint32_t kMinVersion = 1, kMaxVersion = 1;
 
-/// The I/O thread's view of a request: enough to queue, answer or refuse it, without looking at an image.
+/// What the I/O thread needs of a request to queue, answer or refuse it, without reading an image.
 struct Envelope {
   std::uint32_t version = 0;
   std::uint64_t request_id = 0;
   Kind kind = Kind::unknown;
-  std::size_t body_at = 0, body_size = 0;    // place of the serialized Hello, Describe, Act or Health in the request
+  std::size_t body_at = 0, body_size = 0;  // byte range of the serialized Hello, Describe, Act or Health in the request
   std::optional<std::uint64_t> deadline_ms;  // of an act
   std::string policy;                        // of an act
 
-  /// Not kept as a span: a message that ZeroMQ stores inside its own object moves with it.
+  /// An offset, not a span: ZeroMQ may store a small message inside its object, which moves.
   std::span<const std::byte> body(std::span<const std::byte> request) const {
     return request.subspan(body_at, body_size);
   }
 };
 
-/// Walks over the fields of a serialized Request, and of an Act in it, without copying one. After an error `envelope`
-/// holds what was read before it, so that the refusal can carry the request's number. Errors: bad_request,
-/// incompatible.
+/// Reads the fields of a serialized Request, and of an Act in it, without copying one. After an error `envelope` holds
+/// the fields read so far, so that the refusal can carry the request's number. Errors: bad_request, incompatible.
 Status read_envelope(std::span<const std::byte> request, Envelope& envelope);
 
-/// The refusal of a peer that speaks versions `min` to `max` only.
+/// The refusal for a peer that speaks only versions `min` to `max`.
 Error incompatible(std::uint32_t min, std::uint32_t max);
 
 }  // namespace vla::wire

@@ -40,7 +40,7 @@ bool Fields::read_value(std::uint32_t wire_type) {
     case 5:
       type = 'f';
       return input_.Skip(4);
-    default:  // groups, which proto3 does not have
+    default:  // groups do not exist in proto3
       return false;
   }
 }

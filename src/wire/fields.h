@@ -13,19 +13,19 @@
 
 namespace vla::wire {
 
-/// The error that a client which follows the schema never gets.
+/// An error for bytes that no client sends which follows the schema.
 Error not_a_request(std::string where, std::string expected, std::string found);
 
-/// Walks over the fields of one serialized message, without copying or allocating. A field takes two bytes on the wire
-/// and a hundred when it is parsed into an object, so their number is bounded here, before anything is parsed.
+/// Iterates over the fields of one serialized message without copying or allocating. A field takes two bytes on the
+/// wire and a hundred as an object, so their number is limited here, before anything is parsed.
 class Fields {
  public:
-  static constexpr int kMax = 1 << 14;  // the values of a state or of noise that are not packed are fields
+  static constexpr int kMax = 1 << 14;  // unpacked values of a state or of noise count as fields
 
   Fields(std::span<const std::byte> bytes, const char* where);
 
-  /// The field that was read last: its number; its encoding, `v` varint, `b` bytes, `f` four bytes, `d` eight; and its
-  /// value where it is a varint or bytes.
+  /// The last field read: its number; its encoding: `v` varint, `b` bytes, `f` four bytes, `d` eight bytes; and its
+  /// value if it is a varint or bytes.
   int number = 0;
   char type = '?';
   std::uint64_t varint = 0;
@@ -33,7 +33,7 @@ class Fields {
 
   /// False at the end of the bytes. Errors: bad_request.
   Result<bool> next();
-  /// The refusal of the field that was read last.
+  /// The refusal of the last field read.
   Error unknown() const;
 
  private:

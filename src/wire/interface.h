@@ -8,8 +8,8 @@
 
 namespace vla::wire {
 
-/// The part of a description that a client relies on, as bytes: inputs and outputs of the policy and of each of its
-/// robots, without who computes them, limits and names in the server.
+/// The part of a description that clients rely on, as bytes: inputs and outputs of the policy and of each robot,
+/// without runtime, limits and the server's names.
 std::string interface_of(v1::Description description);
 
 }  // namespace vla::wire

@@ -33,7 +33,7 @@ Result<std::string> read_text(const std::string& file) {
   return std::string(reinterpret_cast<const char*>(bytes.data()), bytes.size());
 }
 
-/// A key that others use is never lost.
+/// Never overwrites a key that may be in use.
 Status write_key(const std::string& file, const char* key, unsigned mode) {
   const std::string line = std::string(key) + "\n";
   if (const Status written = write_new_file(file, std::as_bytes(std::span(line)), mode); !written)
@@ -53,7 +53,7 @@ Status write_key_pair(const std::string& prefix) {
                  "name another prefix, or remove the old keys"};
   VLA_CHECK(write_key(prefix + ".secret", secret_key.data(), 0600));
   const Status written = write_key(prefix + ".public", public_key.data(), 0644);
-  if (!written) ::unlink((prefix + ".secret").c_str());  // half a pair is of no use
+  if (!written) ::unlink((prefix + ".secret").c_str());  // removes the secret key: half a pair is useless
   return written;
 }
 

@@ -19,7 +19,7 @@ constexpr std::string_view kHelloMark("\x05HELLO\x01\x00", 8), kInitiateMark("\x
 
 using Nonce = std::array<unsigned char, 24>;
 
-/// A prefix of the RFC and the bytes that make it unique.
+/// A nonce: the RFC's prefix and the bytes that make it unique.
 Nonce nonce_of(std::string_view prefix, const unsigned char* rest) {
   Nonce nonce;
   std::copy(prefix.begin(), prefix.end(), nonce.begin());
@@ -102,7 +102,7 @@ Result<CurveSession::Reply> CurveSession::initiate(std::span<const unsigned char
                            own_transient_secret_.data()) != 0)
     return refused("handshake", "an INITIATE by the one who said HELLO");
 
-  // Only who has the client's long-term secret key can have vouched for its transient key, to this server.
+  // Only the owner of the client's long-term secret key can have vouched for its transient key to this server.
   const unsigned char *const client = writable(content, 0), *const vouch_nonce = client + kKey;
   std::array<unsigned char, 2 * kKey> vouch;
   if (crypto_box_open_easy(vouch.data(), vouch_nonce + kLongNonce, kVouch, nonce_of("VOUCH---", vouch_nonce).data(),

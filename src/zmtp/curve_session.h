@@ -16,32 +16,32 @@ namespace vla::zmtp {
 /// Keys of a server, as bytes.
 struct CurveKeys {
   std::array<unsigned char, 32> secret = {}, own_public = {};
-  std::set<std::string> clients;  // 32 bytes each: the public keys of those who are let in
+  std::set<std::string> clients;  // public keys of admitted clients, 32 bytes each
 };
 
-/// The server's side of CurveZMQ (ZeroMQ RFC 26) for one connection: three commands each way, then boxes. Nonces of the
-/// peer have to rise, so that nothing can be sent twice. Errors have the code `bad_request`; their place is `key` for a
-/// client that is not listed, else `handshake` or `protocol`.
+/// The server's side of CurveZMQ (ZeroMQ RFC 26) for one connection: three commands each way, then boxes. The peer's
+/// nonces must rise, which prevents replays. Errors have the code `bad_request`. Their place is `key` for a client that
+/// is not listed, else `handshake` or `protocol`.
 class CurveSession {
  public:
   explicit CurveSession(const CurveKeys& keys) : keys_(keys) {}
 
   struct Reply {
     std::string command;
-    std::string metadata;  // of the client's INITIATE; empty before
-    bool refused = false;  // the connection ends after this command
+    std::string metadata;  // metadata of the client's INITIATE; empty before
+    bool refused = false;  // the connection ends after this command is sent
   };
   /// The server's answer to a HELLO or an INITIATE.
   Result<Reply> handshake(std::span<const std::byte> command);
   bool is_open() const { return state_ == State::open; }
-  /// The client's long-term public key, once it was proven: 40 characters of Z85.
+  /// The client's proven long-term public key: 40 characters of Z85.
   const std::string& client_key() const { return client_key_; }
 
-  /// How many bytes a box adds to what is in it.
+  /// How many bytes a box adds to its content.
   static constexpr std::size_t kOverhead = 8 + 8 + 16;
-  /// Opens a MESSAGE in place: its content, a byte of flags first, lies at `kOverhead`. Errors: protocol.
+  /// Decrypts a MESSAGE in place. Its content, which begins with a byte of flags, is at `kOverhead`. Errors: protocol.
   Status open(std::span<std::byte> message);
-  /// A MESSAGE with this content.
+  /// Encrypts this content as a MESSAGE.
   std::string seal(const std::string& content);
 
  private:

@@ -33,9 +33,10 @@ using Local = asio::local::stream_protocol;
 using boost::system::error_code;
 using net::Standing;
 
-constexpr std::size_t kMaxAnswers = 64;        // that one connection may leave unread
-constexpr std::size_t kMaxUnread = 128 << 10;  // bytes of them before it is not read from; twice that are kept
-constexpr int kTurn = 4;                       // messages of a connection before the others get their turn
+constexpr std::size_t kMaxAnswers = 64;  // answers that a connection may leave unread
+// unread bytes after which a connection is not read from; twice as many are kept
+constexpr std::size_t kMaxUnread = 128 << 10;
+constexpr int kTurn = 4;  // messages of a connection before others get a turn
 constexpr int kHandshakePatience = 10, kSilencePatience = 15, kPingAfter = 5;  // in sweeps
 
 /// The first address of an interface, IPv4 before IPv6.
@@ -59,7 +60,8 @@ std::optional<asio::ip::address> address_of_interface(const std::string& name) {
   return found;
 }
 
-/// HOST:PORT of a `tcp://` endpoint, HOST an address, an IPv6 address in brackets, an interface, or `*`.
+/// Splits a `tcp://` endpoint into HOST and PORT. HOST is an address, an IPv6 address in brackets, an interface, or
+/// `*`.
 std::optional<tcp::endpoint> tcp_endpoint(const std::string& where) {
   const std::size_t colon = where.rfind(':');
   std::string host = where.substr(0, colon);
@@ -112,7 +114,7 @@ void set_options(Local::socket&) {}
 
 class Connection;
 
-/// The common state of the connections of a hub.
+/// State that all connections of a hub share.
 struct Shared : net::Connections<Connection> {
   const CurveKeys* keys;
   Hub::Handler* handler = nullptr;
@@ -155,14 +157,14 @@ class Connection : public std::enable_shared_from_this<Connection> {
     shared_.connections.erase(client_.connection);
   }
 
-  /// Once a second of this process: a machine that stood still must not cost its clients the connection.
+  /// Called once per second of this process's own time: if the machine was suspended, clients keep their connections.
   void sweep() {
     ++age_;
     ++silent_;
     slow_ = session_.is_receiving() ? slow_ + 1 : 0;
     if (!session_.is_open() && age_ > kHandshakePatience) return drop("handshake", "none within 10 s");
     if (silent_ > kSilencePatience) return drop("silent", "no byte for 15 s");
-    // The heartbeats of a peer wait behind its request: while that is on its way, ours show that somebody is here.
+    // A peer's heartbeats wait behind its request. While that arrives, ours show that the server is alive.
     if (session_.is_open() && out_.empty() && (slow_ > 1 || silent_ > kPingAfter)) send(session_.ping());
   }
 
@@ -173,7 +175,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   bool has_answers() const { return !out_.empty(); }
 
  private:
-  /// No memory on the way costs this connection only.
+  /// If memory runs out, only this connection ends.
   template <class Step>
   void guard(Step step) {
     try {
@@ -195,7 +197,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
                             });
   }
 
-  /// A few of the messages that came; the rest when the other connections had their turn, or when the peer has read.
+  /// Handles a few received messages. The rest follow after other connections had a turn, or once the peer has read its
+  /// answers.
   void handle() {
     guard([this] {
       for (int i = 0; i < kTurn; ++i) {
@@ -248,9 +251,9 @@ class Connection : public std::enable_shared_from_this<Connection> {
   Client client_;
   const std::string group_;  // of its address
   Session session_;
-  std::deque<std::string> out_;  // the first one is on its way
+  std::deque<std::string> out_;  // the first one is being written
   Clock::time_point began_ = client_.since, served_ = {};
-  int age_ = 0, silent_ = 0, slow_ = 0;  // sweeps: since it came, since a byte, since a request began
+  int age_ = 0, silent_ = 0, slow_ = 0;  // sweeps since: the connection came, a byte came, a request began
   std::size_t n_held_ = 0, n_unread_ = 0;
   bool is_paused_ = false, is_closed_ = false;
 };
@@ -271,9 +274,9 @@ class Hub::Sockets : public Shared {
       if (endpoint.starts_with("ipc://")) {
         std::string path = endpoint.substr(6);
         if (path.front() == '@') {
-          path.front() = '\0';  // an abstract address, which is no file
+          path.front() = '\0';  // an abstract address has no file
         } else {
-          ::unlink(path.c_str());  // it was checked that no process serves it
+          ::unlink(path.c_str());  // no process serves it: that was checked
           paths_.push_back(path);
         }
         locals_.emplace_back(loop.context(), Local::endpoint(path));
@@ -312,7 +315,7 @@ class Hub::Sockets : public Shared {
 
   void sweep() {
     sweep_all();
-    if (std::exchange(has_freed, false)) ::malloc_trim(0);  // else the process keeps what a flood took
+    if (std::exchange(has_freed, false)) ::malloc_trim(0);  // returns memory that a flood took to the system
   }
 
   std::list<net::Listener<tcp>> tcps_;

@@ -14,13 +14,13 @@
 namespace vla::zmtp {
 namespace {
 
-constexpr unsigned kMore = 1, kLong = 2, kCommand = 4;   // flags of a frame
-constexpr unsigned kMoreInside = 1, kCommandInside = 2;  // of what is in a CURVE box
-constexpr int kMaxFrames = 1024;                         // of a message that is read over in order to refuse it
+constexpr unsigned kMore = 1, kLong = 2, kCommand = 4;  // flags of a frame
+constexpr unsigned kMoreInside = 1, kCommandInside = 2;  // flags inside a CURVE box
+constexpr int kMaxFrames = 1024;  // frames of a refused message that are skipped
 constexpr std::size_t kGreeting = 64, kMaxCommand = 4096;
-constexpr std::size_t kStep = 256 << 10;     // most bytes that are read at once, so that connections take turns
-constexpr std::size_t kPrefix = 64;          // of a message that is refused: enough for its number
-constexpr std::uint64_t kMaxSkip = 1 << 30;  // of a frame that is read over in order to refuse it
+constexpr std::size_t kStep = 256 << 10;  // most bytes read at once, so that connections take turns
+constexpr std::size_t kPrefix = 64;  // bytes kept of a refused message: enough for its number
+constexpr std::uint64_t kMaxSkip = 1 << 30;  // bytes of a refused frame that are skipped
 constexpr std::string_view kSignature("\xff\0\0\0\0\0\0\0\0\x7f", 10);
 
 Error ended(const char* why, std::string expected, std::string found) {
@@ -34,12 +34,12 @@ std::string_view text_of(std::span<const std::byte> bytes) {
 std::string greeting(bool with_keys) {
   std::string text(kSignature);
   text.append("\x03\x01", 2).append(with_keys ? "CURVE" : "NULL").resize(32);
-  text += with_keys ? '\1' : '\0';  // the server's side
+  text += with_keys ? '\1' : '\0';  // as-server
   text.resize(kGreeting);
   return text;
 }
 
-/// The value of a property in metadata: names with a length of one byte, values with one of four.
+/// A property's value in metadata: names have a length of one byte, values one of four.
 std::optional<std::string_view> property(std::string_view metadata, std::string_view name) {
   while (!metadata.empty()) {
     const std::size_t n_name = static_cast<unsigned char>(metadata[0]);
@@ -90,7 +90,7 @@ Result<std::optional<Message>> Session::next() {
       const std::string_view came = text_of(staged());
       const bool is_zmtp = (came.empty() || came[0] == kSignature[0]) &&
                            (came.size() < 10 || came[9] == kSignature[9]) &&
-                           (came.size() < 11 || came[10] >= 3);  // the bytes between may be anything
+                           (came.size() < 11 || came[10] >= 3);  // the bytes between may have any value
       if (!is_zmtp) return ended("handshake", "a greeting of ZMTP 3", "other bytes");
       if (came.size() < kGreeting) return std::optional<Message>();
       VLA_CHECK(greet());
@@ -117,7 +117,7 @@ Status Session::greet() {
   return {};
 }
 
-/// Reads a header: flags, and a size of one or of eight bytes. False where it is not whole.
+/// Reads a frame's header: flags, and a size of one or eight bytes. False if it is incomplete.
 Result<bool> Session::begin_frame() {
   const std::span<const std::byte> came = staged();
   if (came.empty()) return false;
@@ -153,7 +153,7 @@ Status Session::choose_memory() {
     if (bytes) frame_ = std::move(*bytes);
     return bytes.has_value();
   };
-  // What is in a box cannot be known without all of it.
+  // A box must be complete before it can be decrypted.
   if (refused && curve_ && size_ > limit) return ended("size", refused->expected, refused->found);
   if (!refused && !keep(size_)) {
     if (curve_) return ended("memory", fmt::format("{} bytes", size_), "no memory");
@@ -219,7 +219,7 @@ Status Session::handshake(std::span<const std::byte> command) {
   return {};
 }
 
-/// PING: two bytes of time to live, and a context that comes back in PONG.
+/// PING: two bytes of time to live, and a context that PONG returns.
 Status Session::heartbeat(std::span<const std::byte> command) {
   constexpr std::string_view kPing("\x04PING", 5), kPong("\x04PONG", 5);
   const std::string_view text = text_of(command);
@@ -230,7 +230,7 @@ Status Session::heartbeat(std::span<const std::byte> command) {
   return {};
 }
 
-/// The message, once its last frame is there.
+/// Returns the message once its last frame is complete.
 std::optional<Message> Session::end_part(bool more) {
   if (!message_) message_.emplace();
   if (n_part_ == 0 && size_ == 0 && more && !message_->delimiter) {
@@ -241,7 +241,7 @@ std::optional<Message> Session::end_part(bool more) {
     message_->bytes = std::exchange(frame_, {});
     message_->size = size_;
     n_part_ = 1;
-  } else if (!message_->refused) {  // of an encrypted message, seen only now
+  } else if (!message_->refused) {  // the flag of an encrypted frame, readable only now
     message_->refused = Error{Code::bad_request, "request", "one frame", "several", "see docs/protocol.md"};
   }
   if (more) return std::nullopt;
