@@ -11,14 +11,14 @@
 
 namespace vla::capi {
 
-/// Keeps an error for `last_error` of this thread. Returns its status.
+/// Stores an error for this thread's `last_error`. Returns its status.
 vla_status fail(const vla_policy* policy, Error error) noexcept;
-/// The same for an unexpected exception, and for out of memory, where no string can be made.
+/// The same for an unexpected exception, and for out of memory, when no string can be allocated.
 vla_status fail_unexpected(const vla_policy* policy, const char* what) noexcept;
 vla_status fail_without_memory(const vla_policy* policy) noexcept;
 const vla_error* last_error(const vla_policy* policy) noexcept;
 
-/// Runs what a function of the interface does; whatever fails or throws in it becomes the caller's status.
+/// Runs the body of an interface function. An error or exception in it becomes the caller's status.
 template <class F>
 vla_status guarded(const vla_policy* policy, F&& body) noexcept {
   try {

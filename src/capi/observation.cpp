@@ -13,7 +13,7 @@ std::span<const std::byte> bytes_of(const vla_view& view) {
   return {static_cast<const std::byte*>(view.data), view.size};
 }
 
-/// Rows with or without gaps between them, as (height, width, 3).
+/// Copies rows, with or without padding between them, to (height, width, 3).
 Result<Frame> read_rows(const vla_view& view, const std::string& where) {
   if (view.width < 1 || view.height < 1 || std::int64_t{view.width} * view.height > ImageLimits{}.max_pixels)
     return Error{Code::bad_observation, where, fmt::format("1 to {} pixels", ImageLimits{}.max_pixels),
@@ -65,7 +65,7 @@ Status read_views(const vla_observation& given, const FeatureNames& features, Ob
   return {};
 }
 
-/// Without a name a state is the only one that there is.
+/// A state without a name is the policy's only state.
 Result<std::string> state_name(const vla_state& state, const FeatureNames& features, const std::string& where) {
   if (state.name != nullptr) return read_name(state.name, where);
   if (features.names().size() == 1) return features.names().front();
@@ -88,7 +88,7 @@ Status read_states(const vla_observation& given, const FeatureNames& features, O
   return {};
 }
 
-/// Without a default: a chunk from noise that was not chosen could not be reproduced.
+/// There is no default: a chunk from noise that nobody chose cannot be reproduced.
 Result<Noise> read_noise(const vla_observation& given, const Robot& robot) {
   if (given.has_seed > 1) return usage("observation.has_seed", "0 or 1", std::to_string(given.has_seed));
   const bool has_noise = given.noise != nullptr;
@@ -106,7 +106,7 @@ Result<Noise> read_noise(const vla_observation& given, const Robot& robot) {
   return Noise(std::vector<float>(given.noise, given.noise + given.n_noise));
 }
 
-/// The engine checks what it says; here only whether it says one thing.
+/// Checks only that the leftover is given consistently; the engine checks its values.
 Result<std::optional<Leftover>> read_leftover(const vla_observation& given) {
   if (given.leftover == nullptr) {
     if (given.n_leftover == 0 && given.leftover_delay == 0 && given.schedule == nullptr && given.max_guidance == 0)

@@ -15,17 +15,17 @@
 
 namespace vla::capi {
 
-/// Larger than any struct of the interface will ever be, so that a size that was never set does not send us reading.
+/// No struct of the interface will ever be this large. Catches sizes that were never set.
 inline constexpr std::size_t kMaxStruct = 4096;
-/// Entries of an array of the caller, and bytes of a name.
+/// Most entries in a caller's array, and most bytes in a name.
 inline constexpr std::size_t kMaxEntry = 256, kMaxName = 4096;
 
 inline Error usage(std::string where, std::string expected, std::string found, std::string hint = {}) {
   return {Code::usage, std::move(where), std::move(expected), std::move(found), std::move(hint)};
 }
 
-/// A struct of the caller as this library knows it: fields that the caller was compiled without are zero. Bytes that
-/// this library was compiled without must be zero, or a request would be ignored silently.
+/// Copies a caller's struct into this library's version of it. Fields that the caller was compiled without are zero.
+/// Bytes that this library does not know must be zero: otherwise a request would be ignored silently.
 template <class T>
 Result<T> read_struct(const void* given, const std::string& where) {
   if (given == nullptr) return usage(where, "a pointer", "NULL");
@@ -42,7 +42,7 @@ Result<T> read_struct(const void* given, const std::string& where) {
   return known;
 }
 
-/// An array of such structs; the first one's size is the distance from one to the next.
+/// An array of such structs. The first one's size is the stride.
 template <class T>
 Result<std::vector<T>> read_structs(const T* given, std::size_t count, const std::string& where) {
   if (count > kMaxEntry) return usage(where, fmt::format("at most {} entries", kMaxEntry), std::to_string(count));
@@ -60,7 +60,7 @@ Result<std::vector<T>> read_structs(const T* given, std::size_t count, const std
   return known;
 }
 
-/// A name that the caller ends with a NUL.
+/// A name that ends with NUL.
 inline Result<std::string> read_name(const char* given, const std::string& where) {
   if (given == nullptr) return usage(where, "a name", "NULL");
   const std::size_t size = ::strnlen(given, kMaxName + 1);

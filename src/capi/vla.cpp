@@ -79,7 +79,7 @@ Status open(const char* path, const vla_options* options, vla_policy** out) {
   return {};
 }
 
-/// Images are decoded before the turn comes, so that callers wait for the engine alone.
+/// Decodes images before it takes the engine's lock, so that callers wait for the engine only.
 Status act(vla_policy* policy, const vla_observation* observation, vla_chunk** out) {
   if (out == nullptr) return usage("out", "a place for the chunk", "NULL");
   *out = nullptr;

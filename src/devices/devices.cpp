@@ -34,7 +34,7 @@ Result<std::vector<DeviceInfo>> list(const std::string& library) {
   return loaded->list();
 }
 
-/// The library of a kind whose own kernels are one, and ggml's backend another.
+/// The name of the library with ggml's backend, for a kind that has a library of our own kernels too.
 std::string library_of(const std::string& kind, Arithmetic::Backend backend) {
   return kind == "cuda" && backend == Arithmetic::Backend::ggml ? "cuda-ggml" : kind;
 }
@@ -48,7 +48,7 @@ Result<std::unique_ptr<Device>> open_cpu(int n_thread, const std::string& kernel
   return lower::CpuDevice::open(n_thread, arithmetic);
 }
 
-/// The error for a device that is absent, with the devices that are there instead.
+/// The error for an absent device, with the devices that are present.
 Error absent(const DeviceName& name, const std::string& reason) {
   std::string here;
   for (const DeviceInfo& device : list_devices().devices)

@@ -19,13 +19,13 @@ namespace fs = std::filesystem;
 
 using Loaded = Result<const DeviceLibrary*>;
 
-/// The program or library that this code was linked into.
+/// The program or library that contains this code.
 fs::path own_file() {
   Dl_info info = {};
   link_map* map = nullptr;
   const bool found =
       dladdr1(reinterpret_cast<void*>(&own_file), &info, reinterpret_cast<void**>(&map), RTLD_DL_LINKMAP) != 0;
-  std::error_code error;  // a program has no name in the linker's list
+  std::error_code error;  // the linker lists the program without a name
   return fs::canonical(found && map->l_name[0] != '\0' ? map->l_name : "/proc/self/exe", error);
 }
 
@@ -44,7 +44,7 @@ Error absent(const std::string& kind, std::string reason) {
 }
 
 Loaded load(const std::string& kind, const fs::path& file) {
-  void* library = dlopen(file.c_str(), RTLD_NOW | RTLD_LOCAL);  // never closed: drivers leave threads behind
+  void* library = dlopen(file.c_str(), RTLD_NOW | RTLD_LOCAL);  // never closed: drivers keep threads
   if (library == nullptr) return absent(kind, dlerror());
   const auto entry = reinterpret_cast<decltype(&vla_device_library)>(dlsym(library, kDeviceLibrarySymbol));
   const DeviceLibrary* found = entry != nullptr ? entry() : nullptr;

@@ -6,9 +6,9 @@
 
 namespace vla {
 
-/// A library of devices: libvla-vulkan.so, libvla-cuda.so or libvla-cuda-ggml.so by what follows `libvla-`, looked for
-/// where the running code lies (the program's folder, or that of libvla.so) and in the library folder beside it, loaded
-/// once and kept. Errors: device, with the reason as `found`.
+/// Loads a library of devices once and keeps it: libvla-NAME.so, where NAME is vulkan, cuda or cuda-ggml. It is
+/// searched beside the running code (program or libvla.so) and in the library folder beside that. Errors: device, with
+/// the reason as `found`.
 Result<const DeviceLibrary*> device_library(const std::string& kind);
 
 }  // namespace vla

@@ -26,7 +26,7 @@ Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
   held.backend.reset(ggml_backend_cpu_init());
   if (!held.backend) return Error{Code::device, "cpu", "a backend", "the system refused it"};
   ggml_threadpool_params params = ggml_threadpool_params_default(n_thread);
-  params.poll = 0;  // between two runs its threads sleep
+  params.poll = 0;  // its threads sleep between two runs
   held.pool.reset(ggml_threadpool_new(&params));
   ggml_backend_cpu_set_threadpool(held.backend.get(), held.pool.get());
   ggml_backend_cpu_set_n_threads(held.backend.get(), n_thread);
@@ -39,7 +39,7 @@ Result<std::unique_ptr<Device>> open_reference(int n_thread) { return GgmlDevice
 Result<std::unique_ptr<Device>> GgmlDevice::open(ggml_backend_dev_t of, const std::string& name, bool keeps_f16,
                                                  Rounding rounding) {
   auto device = std::make_unique<GgmlDevice>();
-  device->n_thread_ = 1;  // the one that calls
+  device->n_thread_ = 1;  // the calling thread
   device->text_ = fmt::format("{}, {}", name, ggml_backend_dev_description(of));
   device->keeps_f16_ = keeps_f16, device->rounding_ = rounding;
   Held& held = *device->held_;
@@ -49,8 +49,8 @@ Result<std::unique_ptr<Device>> GgmlDevice::open(ggml_backend_dev_t of, const st
   return std::unique_ptr<Device>(std::move(device));
 }
 
-/// To free what a lost device holds the driver would answer with one more error, which no destructor can report. It is
-/// kept to the end of the process instead, and so are those of other devices whose locks an abort may have left held.
+/// Leaks what a lost device holds until the process ends: freeing it would raise another driver error, which a
+/// destructor cannot report. The same for other devices after an abort, which may have left their locks held.
 GgmlDevice::~GgmlDevice() {
   if (!backend()) return;
   const Status answers = guarded([&] { ggml_backend_synchronize(backend()); });
@@ -60,8 +60,8 @@ GgmlDevice::~GgmlDevice() {
   held->next = kept.exchange(held);
 }
 
-/// The type of a parameter on the device: matrices are widened where a backend's products of bf16 and f16 would round
-/// the activations first, unless that was asked for. Rows of a table are widened exactly when they are looked up.
+/// The type of a parameter on the device. Matrices become float32 if the backend's products of bf16 and f16 would round
+/// activations, unless rounding was asked for. Table rows are widened exactly at lookup.
 ggml_type GgmlDevice::resident_type(const Param& param) const {
   const ggml_type type = type_of(resident_encoding(param, rounding_).type);
   const bool kept = type == GGML_TYPE_F16 ? keeps_f16_ : type == GGML_TYPE_BF16 && rounding_ == Rounding::bf16;
@@ -71,7 +71,7 @@ ggml_type GgmlDevice::resident_type(const Param& param) const {
 Status GgmlDevice::load(const ParamList& params, bool fill, const WeightPlan& plan) {
   VLA_CHECK(check_rounding(params, rounding_));
   memory().set_dry(!fill);
-  held_->working.clear();  // of programs that are gone
+  held_->working.clear();  // of freed programs
   windows_.reset();
   VLA_CHECK(make_tensors(params, plan));
   if (weights_.empty()) return {};
@@ -102,7 +102,7 @@ Status GgmlDevice::make_tensors(const ParamList& params, const WeightPlan& plan)
   return {};
 }
 
-/// Resident parameters and windows one after the other, and what is streamed in the windows.
+/// Places resident parameters and windows in order, and streamed matrices inside the windows.
 Status GgmlDevice::give_places(const WeightPlan& plan) {
   window_tensors_.clear();
   for (int i = 0; i < lower::WeightStream::kWindows && !plan.streamed.empty(); ++i)
@@ -120,7 +120,7 @@ Status GgmlDevice::give_places(const WeightPlan& plan) {
   return {};
 }
 
-/// Bytes from a matrix to what lies behind it.
+/// Bytes from a matrix to the next one in its window.
 std::size_t GgmlDevice::size_of(const Param& matrix) const { return memory().size_of(weight(&matrix)); }
 
 Status GgmlDevice::upload(const ParamList& params) {
@@ -190,12 +190,12 @@ Result<ggml_backend_buffer_ptr> GgmlDevice::allocate_host(std::size_t size) cons
   return buffer;
 }
 
-/// Null where there is no memory.
+/// Null if memory is short.
 std::byte* GgmlDevice::staging(std::size_t size) {
   ggml_backend_buffer_ptr& staging = held_->staging;
   if (staging != nullptr && size <= ggml_backend_buffer_get_size(staging.get()))
     return static_cast<std::byte*>(ggml_backend_buffer_get_base(staging.get()));
-  constexpr std::size_t kRest = 65536;  // images come first: what follows them fits as well
+  constexpr std::size_t kRest = 65536;  // images are first, so what follows them fits too
   auto larger = allocate_host(size + kRest);
   if (!larger) return nullptr;
   void* to = ggml_backend_buffer_get_base(larger->get());
@@ -209,7 +209,7 @@ void GgmlDevice::set(const Slot& slot, const void* data, std::size_t size) {
   if (failure_) return;
   const auto* tensor = static_cast<const ggml_tensor*>(slot.place);
   std::size_t begin = 0;
-  bool follows = false;  // the last one, but for the bytes that align it
+  bool follows = false;  // the last one, except for its alignment
   if (!uploads_.empty()) {
     const Upload& last = uploads_.back();
     const auto distance = static_cast<std::size_t>(static_cast<const std::byte*>(tensor->data) -
@@ -279,7 +279,7 @@ Result<std::shared_ptr<ggml_gallocr>> GgmlDevice::place(ggml_cgraph* graph) {
   std::shared_ptr<ggml_gallocr> places = make();
   std::size_t size = 0;
   ggml_gallocr_reserve_n_size(places.get(), graph, nullptr, nullptr, &size);
-  // Places that are shared must lie in one buffer: only then is it certain that nobody's move.
+  // Shared places must be in one buffer, so that none of them moves.
   const bool fits = !held_->working.empty() && size <= held_->working.back().size &&
                     held_->working.back().size <= ggml_backend_buft_get_max_size(memory().type());
   if (!fits) {
@@ -301,7 +301,7 @@ Result<std::unique_ptr<Program>> GgmlDevice::lower(const Graph& graph, const Low
   return GgmlProgram::make(graph, *this);
 }
 
-/// On the host a budget is of the process, which would have the windows twice.
+/// On the host a budget is that of the process, which would have every window twice.
 Result<WeightPlan> GgmlDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
   if (is_host()) return Device::plan_weights(prefix, step, size);
   const auto &first = static_cast<const GgmlProgram&>(prefix), &then = static_cast<const GgmlProgram&>(step);

@@ -16,14 +16,14 @@
 
 namespace vla {
 
-/// A backend of ggml: graphs run as its plain operations, without a node of our own. On the CPU this is the reference
-/// that every kernel and every fusion is tested against; what a graph needs of a backend is in ggml_program.cpp.
+/// A ggml backend as a device: it runs graphs as plain ggml operations, without custom nodes. On the CPU it is the
+/// reference for every kernel and fusion. ggml_program.cpp translates graphs.
 class GgmlDevice final : public Device {
  public:
   /// Errors: device.
   static Result<std::unique_ptr<Device>> cpu(int n_thread);
-  /// A device of another kind, with Rounding::none or bf16: then what matrices of bf16 multiply is rounded to it too.
-  /// `keeps_f16`: its products of f16 weights are as exact as those of float32. Errors: device.
+  /// A device other than the CPU, with Rounding::none or bf16; bf16 also rounds what bf16 matrices multiply.
+  /// `keeps_f16`: products of f16 weights are as exact as those of float32. Errors: device.
   static Result<std::unique_ptr<Device>> open(ggml_backend_dev_t of, const std::string& name, bool keeps_f16,
                                               Rounding rounding);
   ~GgmlDevice() override;
@@ -49,17 +49,16 @@ class GgmlDevice final : public Device {
 
   ggml_backend_t backend() const { return held_->backend.get(); }
   ggml_tensor* weight(const Param* param) const { return weights_[static_cast<std::size_t>(param->id)]; }
-  /// By Param::id, the group that a matrix is streamed in, or -1.
+  /// For each Param::id the group that streams the matrix, or -1.
   const std::vector<int>& groups() const { return groups_; }
   GgmlMemory& memory() const { return *held_->memory; }
-  /// Memory of the host from which the device takes what is uploaded, of the driver's own kind where it has one.
-  /// Errors: device, out_of_memory.
+  /// Allocates host memory for uploads, pinned by the driver if it can. Errors: device, out_of_memory.
   Result<ggml_backend_buffer_ptr> allocate_host(std::size_t size) const;
-  /// Gives the values of a graph their places in memory that programs share, since one runs at a time. What comes back
-  /// keeps it. Errors: out_of_memory.
+  /// Places a graph's values in memory that all programs share, since one runs at a time. The result keeps that memory.
+  /// Errors: out_of_memory.
   Result<std::shared_ptr<ggml_gallocr>> place(ggml_cgraph* graph);
 
-  /// Calls functions of the backend until one fails: from then on every call has that error. Errors: device,
+  /// Calls a function of the backend. After the first failure every call returns that error. Errors: device,
   /// out_of_memory.
   template <class F>
   Status guarded(const F& call) const {
@@ -68,10 +67,10 @@ class GgmlDevice final : public Device {
     if (!done) failure_ = done.error();
     return done;
   }
-  /// Has groups of streamed matrices in memory for what is launched next, until others are wanted. Errors: bad_bundle
-  /// where the file has not their bytes any more, device.
+  /// Loads groups of streamed matrices for the next launches, until others are asked for. Errors: bad_bundle if the
+  /// file no longer has these bytes, device.
   Status bring(const lower::Groups& groups);
-  /// Computes, at the latest when somebody waits. Errors: device, out_of_memory.
+  /// Runs a graph; it is complete at the latest when somebody waits. Errors: device, out_of_memory.
   Status launch(ggml_cgraph* graph);
   Status wait();
 
@@ -83,7 +82,7 @@ class GgmlDevice final : public Device {
     std::shared_ptr<ggml_gallocr> places;
     std::size_t size;
   };
-  /// Bytes for slots that lie side by side, on their way to the device.
+  /// Bytes for adjacent slots that are being sent to the device.
   struct Upload {
     const ggml_tensor* first;
     std::size_t begin, size;  // in `Held::staging`
@@ -97,16 +96,16 @@ class GgmlDevice final : public Device {
   std::byte* staging(std::size_t size);
   Status flush() const;
 
-  /// Everything that the driver is asked to free.
+  /// Everything that the driver must free.
   struct Held {
-    // What threads share during a run; without one of ours ggml makes and frees one in every run.
+    // The thread pool of all runs. Without it ggml makes and frees one in every run.
     std::unique_ptr<ggml_threadpool, FreePool> pool;
     ggml_backend_ptr backend;
     std::optional<GgmlMemory> memory;
-    std::vector<Working> working;  // the last serves new programs; those before it belong to older ones
+    std::vector<Working> working;  // the last one serves new programs, earlier ones belong to older programs
     ggml_backend_buffer_ptr staging;
     std::shared_ptr<void> windows;  // GgmlWindows::held
-    Held* next = nullptr;           // of those that are not freed
+    Held* next = nullptr;  // of programs that are not freed
   };
   ggml_type resident_type(const Param& param) const;
 
@@ -121,7 +120,7 @@ class GgmlDevice final : public Device {
   std::size_t weights_size_ = 0;
   std::vector<ggml_tensor*> weights_;         // by Param::id
   std::vector<int> groups_;                   // the same
-  std::vector<ggml_tensor*> window_tensors_;  // none where all weights are resident
+  std::vector<ggml_tensor*> window_tensors_;  // none if all weights are resident
   std::shared_ptr<lower::DeviceWindows> windows_;
   std::string linear_text_;
   mutable std::vector<Upload> uploads_;

@@ -8,7 +8,7 @@
 
 namespace vla {
 
-/// Opened once, since drivers are slow.
+/// Opens the backend once, since drivers are slow.
 Result<ggml_backend_reg_t> GgmlBackend::registry() const {
   static const Result<ggml_backend_reg_t> opened = [this]() -> Result<ggml_backend_reg_t> {
     set_guard();
@@ -22,7 +22,7 @@ Result<ggml_backend_reg_t> GgmlBackend::registry() const {
   return opened;
 }
 
-/// With driver and version, which a question about wrong values starts from.
+/// Includes driver and version, which a report of wrong values needs first.
 Result<std::vector<DeviceInfo>> GgmlBackend::list() const {
   VLA_TRY(ggml_backend_reg_t found, registry());
   std::vector<DeviceInfo> devices;

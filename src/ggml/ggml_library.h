@@ -8,14 +8,14 @@
 
 namespace vla {
 
-/// A backend of ggml, as libraries of devices describe theirs.
+/// Describes a ggml backend for a library of devices.
 struct GgmlBackend {
   const char* kind;                                  // "vulkan"
-  ggml_backend_reg_t (*open)();                      // null where the driver is missing
+  ggml_backend_reg_t (*open)();  // null if the driver is missing
   std::string (*driver)(ggml_backend_dev_t device);  // its name and version
   bool keeps_f16 = false;                            // its products of f16 weights are as exact as those of float32
 
-  /// As DeviceLibrary::list and DeviceLibrary::open. One backend for each library.
+  /// DeviceLibrary::list and DeviceLibrary::open for one backend per library.
   Result<std::vector<DeviceInfo>> list() const;
   Result<std::unique_ptr<Device>> open_device(int index, Rounding rounding) const;
 
@@ -23,7 +23,7 @@ struct GgmlBackend {
   Result<ggml_backend_reg_t> registry() const;
 };
 
-/// The export of a backend's library.
+/// The function that a backend's library exports.
 template <const GgmlBackend& backend>
 DeviceLibrary library_of() {
   return {kDeviceBuild, [] { return backend.list(); },

@@ -14,7 +14,7 @@
 namespace vla {
 namespace {
 
-/// The address that a tensor without memory seems to have. ggml takes null for a tensor that it has to place.
+/// A placeholder address for tensors without memory. ggml would place a tensor whose address is null.
 void* const kNowhere = reinterpret_cast<void*>(std::uintptr_t{4096});
 
 std::string size_text(std::size_t bytes) {
@@ -36,7 +36,7 @@ Error GgmlMemory::refused(std::size_t size, const char* what) const {
           "the device refused the allocation", "free memory or use a smaller model"};
 }
 
-/// A tensor lies in one buffer. Backends say how large buffers should be, and take larger ones up to the driver's
+/// A tensor must fit into one buffer. Backends state a preferred buffer size and accept larger ones up to the driver's
 /// limit.
 Error GgmlMemory::refused(const Part& part, const char* what) const {
   const std::size_t most = ggml_backend_buft_get_max_size(type_);
@@ -63,7 +63,7 @@ std::size_t GgmlMemory::idle_size() const {
   return size;
 }
 
-/// A buffer that was given back and fits without much waste, or another one.
+/// Reuses a returned buffer that fits without much waste, or allocates one.
 GgmlMemory::Buffer GgmlMemory::take(std::size_t size) const {
   const auto fits = [&](const Buffer& buffer) { return buffer.size >= size && buffer.size <= 2 * size + 65536; };
   const auto found = std::find_if(kept_->begin(), kept_->end(), fits);
@@ -117,7 +117,7 @@ std::size_t GgmlMemory::size_of(const ggml_tensor* tensor) const {
   return GGML_PAD(ggml_backend_buft_get_alloc_size(type_, tensor), ggml_backend_buft_get_alignment(type_));
 }
 
-/// Tensors one after the other, as many as a buffer holds.
+/// Fills each buffer with as many tensors as fit, in order.
 std::vector<GgmlMemory::Part> GgmlMemory::cut(ggml_context* tensors) const {
   const std::size_t most = ggml_backend_buft_get_max_size(type_);
   std::vector<Part> parts;

@@ -35,7 +35,7 @@ ggml_type type_of(DType type) {
     case DType::ternary:  // its bytes
     case DType::int4:
       return GGML_TYPE_I8;
-    case DType::f64:  // of statistics alone, which no graph reads
+    case DType::f64:  // f64 occurs in statistics only, which no graph reads
     case DType::f32:
       break;
   }

@@ -8,11 +8,11 @@
 
 namespace vla {
 
-/// The type of tensors that have these elements; bytes of codes.
+/// The ggml type for elements of this dtype; codes are bytes.
 ggml_type type_of(DType type);
 
-/// How a matrix lies in a tensor of float32, bf16 or float16: rows one after the other. Ternary codes are float32
-/// without their scale.
+/// Packs a matrix into a tensor of float32, bf16 or float16, row by row. Ternary codes become float32 without their
+/// scale.
 lower::MatrixPlace place_of(const Param& matrix, ggml_type type);
 
 }  // namespace vla

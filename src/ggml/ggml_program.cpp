@@ -9,8 +9,8 @@
 namespace vla {
 namespace {
 
-/// Translates each node to an operation of ggml, or a few. Where ggml's own would differ from float32 in the last
-/// digits it is composed of exact ones.
+/// Translates each node to one or a few ggml operations. If ggml's own operation differs from float32 in the last
+/// digits, it is composed of exact ones.
 class Translator {
  public:
   Translator(ggml_context* context, ggml_context* constants, GgmlDevice& device)
@@ -27,8 +27,8 @@ class Translator {
 
  private:
   ggml_tensor* in(std::size_t i) const { return made_[static_cast<std::size_t>(node_->in[i].node()->id)]; }
-  /// Not every operation takes the strides that a view may have in dimensions of size one, nor a view that begins where
-  /// the backend would place no tensor.
+  /// Makes a view contiguous: some operations do not accept a view's strides in dimensions of size one, or a view that
+  /// begins at an address where the backend would not place a tensor.
   ggml_tensor* contiguous(ggml_tensor* x) const {
     if (!ggml_is_contiguous(x) || x->view_offs % alignment_ != 0) return ggml_cont(c, x);
     return x->view_src != nullptr ? ggml_reshape(c, x, x) : x;
@@ -46,16 +46,16 @@ class Translator {
     ggml_tensor* y = op.rule == op::Rule::int8_rows ? int8_product(op) : product(device_.weight(op.weight));
     return op.bias != nullptr ? ggml_add(c, y, device_.weight(op.bias)) : y;
   }
-  /// Vulkan repeats no matrix along the fourth dimension: there all rows are one matrix.
+  /// Vulkan does not repeat a matrix along the fourth dimension, so all rows become one matrix.
   ggml_tensor* product(ggml_tensor* weight) {
     ggml_tensor* x = contiguous(in(0));
     if (x->ne[3] == 1) return ggml_mul_mat(c, weight, x);
     ggml_tensor* rows = ggml_reshape_2d(c, x, x->ne[0], ggml_nrows(x));
     return reshaped(ggml_mul_mat(c, weight, rows), node_->shape);
   }
-  /// Codes are integers in float32, and so small that their sums are exact.
+  /// Codes are integers stored as float32, small enough for exact sums.
   ggml_tensor* int8_product(const op::Linear& op) {
-    constexpr float kRound = 0x1.8p23f;  // adding it rounds to an integer, ties to even
+    constexpr float kRound = 0x1.8p23f;  // adding this constant rounds to an integer, ties to even
     constexpr float kSmallest = 1e-5f;
     ggml_tensor* x = contiguous(in(0));
     const int d_in = static_cast<int>(x->ne[0]);
@@ -76,7 +76,7 @@ class Translator {
     return node_->in.size() > 2 ? ggml_add(c, y, in(2)) : y;
   }
 
-  /// ggml's own rotation multiplies its way from angle to angle: the angles here come from a table.
+  /// Uses angles from a table, because ggml's own rotation computes each angle from the one before by multiplication.
   ggml_tensor* translate(const op::Rope&) {
     ggml_tensor* x = contiguous(in(0));
     ggml_tensor* table = contiguous(in(1));
@@ -94,7 +94,7 @@ class Translator {
     return ggml_concat(c, first, ggml_add(c, ggml_mul(c, b, cosine), ggml_mul(c, a, sine)), 0);
   }
 
-  /// A product, a softmax and a product: ggml's fused attention takes keys and values in float16.
+  /// A product, a softmax and a product, because ggml's fused attention rounds keys and values to float16.
   ggml_tensor* translate(const op::Attention& op) {
     const std::size_t first = op.has_mask ? 2 : 1;
     ggml_tensor *k = in(first), *v = in(first + 1), *q = in(0);
@@ -110,7 +110,7 @@ class Translator {
     return ggml_cont_3d(c, mixed, q->ne[0] * q->ne[1], q->ne[2], q->ne[3]);
   }
 
-  /// ggml's own makes zero of NaN; what is not finite stays so.
+  /// ggml's own ReLU turns NaN into zero; here NaN stays NaN.
   ggml_tensor* relu(ggml_tensor* x) { return ggml_add(c, ggml_relu(c, x), ggml_scale(c, x, 0.0f)); }
 
   ggml_tensor* translate(const op::Activate& op) {
@@ -154,32 +154,32 @@ class Translator {
   }
   ggml_tensor* translate(const op::Reshape&) { return reshaped(in(0), node_->shape); }
   ggml_tensor* translate(const op::Patches& op) {
-    ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, op.size, op.size, 3, 1);  // read for its shape only
+    ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, op.size, op.size, 3, 1);  // only its shape is read
     ggml_tensor* rows = ggml_im2col(c, kernel, contiguous(in(0)), op.size, op.size, 0, 0, 1, 1, true, GGML_TYPE_F32);
     return reshaped(rows, node_->shape);
   }
   ggml_tensor* translate(const op::PixelShuffle& op) {
     ggml_tensor* x = in(0);
     const std::int64_t f = op.factor, n_row = x->ne[1] / op.n_column;
-    // Patch (f R + r, f C + c): c is the fastest after the features, then C, r, R; C and r change places.
+    // Patch (f R + r, f C + c): the order after the features is c, C, r, R; exchanging C and r gives the squares.
     ggml_tensor* split = reshaped(x, {x->ne[0] * f, op.n_column / f, f, n_row / f * x->ne[2]});
     return reshaped(ggml_cont(c, ggml_permute(c, split, 0, 2, 1, 3)), node_->shape);
   }
-  /// ggml's images are [width, height, d], as are the rows of what it unfolds.
+  /// ggml's images and unfolded rows are [width, height, d].
   ggml_tensor* translate(const op::Unfold& op) {
     return reshaped(ggml_cont(c, ggml_permute(c, covered(op.window), 1, 0, 2, 3)), node_->shape);
   }
-  /// The elements that a window covers: [size^2, d, n_place, n_view].
+  /// The elements in a window: [size^2, d, n_place, n_view].
   ggml_tensor* covered(const op::Window& window) {
     const auto [size, stride, padding] = window;
     const Shape& s = node_->shape;
     const std::int64_t d = node_->in[0].dim(0), area = std::int64_t{size} * size;
     ggml_tensor* image = ggml_cont(c, ggml_permute(c, in(0), 2, 0, 1, 3));
-    ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, size, size, d, 1);  // read for its shape only
+    ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, size, size, d, 1);  // only its shape is read
     ggml_tensor* rows = ggml_im2col(c, kernel, image, stride, stride, padding, padding, 1, 1, true, GGML_TYPE_F32);
     return reshaped(rows, {area, d, s[1] * s[2], s[3]});
   }
-  /// ggml's own leaves NaN out; what is not finite stays so.
+  /// ggml's own maximum ignores NaN; here NaN stays NaN.
   ggml_tensor* translate(const op::MaxPool& op) {
     const auto [size, stride, padding] = op.window;
     ggml_tensor* image = ggml_cont(c, ggml_permute(c, in(0), 2, 0, 1, 3));

@@ -10,11 +10,11 @@
 
 namespace vla::net {
 
-/// Bytes of a fixed number, left as the system gave them: a page takes memory only once something was written to it.
+/// A buffer of fixed size, uninitialized: a page takes memory only once it is written.
 class Bytes {
  public:
   Bytes() = default;
-  /// None where there is no memory.
+  /// None if memory is short.
   static std::optional<Bytes> make(std::size_t size) noexcept {
     Bytes bytes;
     bytes.data_.reset(new (std::nothrow) std::byte[size]);
@@ -25,7 +25,7 @@ class Bytes {
   std::size_t size() const { return size_; }
   std::span<std::byte> span() { return {data_.get() + begin_, size_}; }
   std::span<const std::byte> span() const { return {data_.get() + begin_, size_}; }
-  /// Keeps a part of them, in place.
+  /// Narrows the buffer to a part of it, in place.
   void narrow(std::size_t begin, std::size_t size) {
     begin_ += begin;
     size_ = size;

@@ -14,33 +14,33 @@
 namespace vla::net {
 
 struct ConnectionLimits {
-  std::size_t message = 0;      // bytes of a request
+  std::size_t message = 0;  // bytes in one request
   std::size_t connections = 0;  // at once
-  std::size_t receipt = 0;      // bytes of all requests that are not whole yet
+  std::size_t receipt = 0;  // bytes in all incomplete requests
 };
 
-/// The connections of a protocol, and what they may hold together. A Connection has `standing()`, `has_answers()` and
-/// `drop(why, detail)`, which takes it out of the table.
+/// The connections of a protocol and their common limits. A Connection has `standing()`, `has_answers()` and `drop(why,
+/// detail)`, which removes it from the table.
 template <class Connection>
 struct Connections {
   Loop& loop;
   ConnectionLimits limits;
   std::map<std::uint64_t, std::shared_ptr<Connection>> connections = {};  // oldest first
-  std::size_t n_held = 0;                                                 // bytes of requests that are not whole
+  std::size_t n_held = 0;  // bytes in incomplete requests
 
-  /// Null where it has ended. The pointer keeps it while something is done with it.
+  /// Null if it has ended. The pointer keeps it alive while it is used.
   std::shared_ptr<Connection> find(std::uint64_t connection) const {
     const auto found = connections.find(connection);
     return found == connections.end() ? nullptr : found->second;
   }
-  /// Drops connections until no more are left than `limits.connections`.
+  /// Drops connections until at most `limits.connections` are left.
   void evict_idle() {
     while (const auto chosen = to_evict(standings(), limits.connections, loop.now()))
       connections.at(*chosen)->drop("connections",
                                     fmt::format("more than {}, or {} in their handshake, and this one gives way",
                                                 limits.connections, max_handshakes(limits.connections)));
   }
-  /// Drops connections until requests in receipt hold no more than `limits.receipt`.
+  /// Drops connections until incomplete requests hold at most `limits.receipt` bytes.
   void evict_slow_uploads() {
     while (n_held > limits.receipt) {
       const auto chosen = to_interrupt(standings(), limits.connections, limits.message, limits.receipt, loop.now());
@@ -53,7 +53,7 @@ struct Connections {
   bool has_answers() const {
     return std::any_of(connections.begin(), connections.end(), [](const auto& c) { return c.second->has_answers(); });
   }
-  /// Calls `sweep` of each, which may end it.
+  /// Calls `sweep` on each connection, which may end it.
   void sweep_all() {
     const auto all = connections;
     for (const auto& [id, connection] : all) connection->sweep();

@@ -6,7 +6,7 @@
 
 namespace vla::net {
 
-/// How many file descriptors this process can still open, once its limit is raised as far as the system lets it.
+/// How many file descriptors this process can still open, after raising its limit as far as the system allows.
 std::size_t spare_descriptors();
 
 }  // namespace vla::net

@@ -8,19 +8,19 @@
 
 namespace vla::net {
 
-/// Whom an address to bind lets in.
+/// Who can reach a bound address.
 enum class Reach {
-  local,  // this machine: ipc, the loopback addresses, the interface `lo`
-  remote  // anybody who can route to it
+  local,  // this machine only: ipc, loopback addresses, the interface `lo`
+  remote  // every host with a route to it
 };
 
-/// Reads an endpoint of ZeroMQ: `tcp://HOST:PORT`, HOST an IPv4 address, an IPv6 address in brackets, the name of an
-/// interface, or `*` for all of them, PORT a number, 0 or `*` for a free one; or `ipc://PATH`. What is not known to be
-/// local is remote. Errors: usage.
+/// Parses a ZeroMQ endpoint: `tcp://HOST:PORT` or `ipc://PATH`. HOST is an IPv4 address, an IPv6 address in brackets,
+/// an interface, or `*` for all. PORT is a number; 0 or `*` selects a free one. An address that is not known to be
+/// local counts as remote. Errors: usage.
 Result<Reach> reach_of(const std::string& endpoint);
 
-/// A file at an ipc path is removed before it is bound. Anything but a socket without a server is refused here.
-/// `option`: the one that gave the endpoint. Errors: io.
+/// Removes a stale socket at an ipc path before binding. Refuses any other file, and a socket that is being served.
+/// `option`: the option that gave the endpoint. Errors: io.
 Status check_free(const std::string& endpoint, const std::string& option);
 
 }  // namespace vla::net

@@ -15,8 +15,7 @@ namespace ip = boost::asio::ip;
 
 constexpr auto kRecently = std::chrono::minutes(1);
 
-/// The connections with a kept place. Seniority decides, so that whoever comes later cannot take a place by asking more
-/// often.
+/// The connections with a kept place: the oldest ones, so that a newcomer cannot take a place by asking more often.
 std::set<std::uint64_t> kept(const Standings& standings, std::size_t max_connections, Clock::time_point now) {
   std::set<std::uint64_t> kept;
   for (const Standing& s : standings)
@@ -31,7 +30,7 @@ std::map<std::string, std::size_t> sums_by_group(const Standings& standings, Amo
   return sums;
 }
 
-/// The candidate that comes first by `rank`. Of equals it is the oldest: no name decides.
+/// The candidate that is first by `rank`; among equals the oldest.
 template <class Candidate, class Rank>
 std::optional<std::uint64_t> first_of(const Standings& standings, Candidate is_candidate, Rank rank) {
   const Standing* first = nullptr;
@@ -61,7 +60,8 @@ std::optional<std::uint64_t> to_evict(const Standings& standings, std::size_t ma
   const auto n_unfinished = static_cast<std::size_t>(std::count_if(standings.begin(), standings.end(), unfinished));
   const bool is_full = standings.size() > max_connections;
   if (!is_full && n_unfinished <= max_handshakes(max_connections)) return std::nullopt;
-  // Of the connections that could give way alone: a robot's second one must not lose its place because of the first.
+  // Counts only connections that may give way: a robot's second connection must not lose its place because of the
+  // first.
   const auto largest_of = [&](auto is_candidate) {
     const auto sums = sums_by_group(standings, [&](const Standing& s) { return std::size_t{is_candidate(s)}; });
     return first_of(standings, is_candidate, [&](const Standing& s) {

@@ -9,8 +9,7 @@
 
 namespace vla::net {
 
-/// Takes connections at one address, one after the other. Where the system has no descriptor left it tries again after
-/// a moment.
+/// Accepts connections at one address. If no descriptor is left, it tries again a moment later.
 template <class Protocol>
 class Listener {
  public:
@@ -26,7 +25,7 @@ class Listener {
   typename Protocol::endpoint endpoint() const { return acceptor_.local_endpoint(); }
   int descriptor() { return acceptor_.native_handle(); }
 
-  /// Calls `taken` with each connection from now on. To be called again where something was thrown on the way.
+  /// Calls `taken` with each new connection from now on. Call it again after an exception.
   void listen(std::function<void(Socket)> taken) {
     if (!taken_) taken_ = std::move(taken);
     if (!is_waiting_) accept();

@@ -12,7 +12,7 @@
 namespace vla::net {
 namespace {
 
-constexpr int kRound = 64;  // steps of sockets before the caller has its turn
+constexpr int kRound = 64;  // socket events handled before the caller gets a turn
 constexpr Clock::duration kLongest = std::chrono::seconds(1);
 
 }  // namespace
@@ -28,7 +28,7 @@ class Loop::Waiting {
       context.run_one_for(at_most);
       for (int n = 0; n < kRound && !is_woken_ && context.poll_one() > 0; ++n) {
       }
-    } catch (const std::exception&) {  // no memory: what was not begun is begun by the next call
+    } catch (const std::exception&) {  // no memory: the next call begins the rest
     }
   }
 

@@ -14,20 +14,20 @@ class io_context;
 
 namespace vla::net {
 
-/// The event loop of one thread, which the sockets of all protocols share. What uses `context` is destroyed before the
-/// loop, and the loop does not wait any more once the first of them is.
+/// The event loop of one thread, which the sockets of all protocols share. Users of `context` must be destroyed before
+/// the loop; do not call `wait` once one of them is destroyed.
 class Loop {
  public:
-  /// Errors: std::runtime_error where the system has no descriptor.
+  /// Errors: std::runtime_error if the system has no descriptor left.
   explicit Loop(Now now = Clock::now);
   ~Loop();
 
   boost::asio::io_context& context();
   /// From any thread.
   Clock::time_point now() const { return now_(); }
-  /// Handles what sockets and timers bring until `fd`, the same in every call, can be read or `until` has come, for a
-  /// second at most, and for one turn at least. `begin` starts what waits: where it throws for lack of memory, the next
-  /// call begins the rest.
+  /// Handles sockets and timers until `fd` (the same in every call) is readable or `until` has passed: for one turn at
+  /// least, for a second at most. `begin` starts pending operations; if it throws for lack of memory, the next call
+  /// begins the rest.
   void wait(const std::function<void()>& begin, int fd, std::optional<Clock::time_point> until);
 
  private:

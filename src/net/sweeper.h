@@ -8,12 +8,13 @@
 
 namespace vla::net {
 
-/// Calls a function once a second, as far as this process runs: a machine that stood still counts no second.
+/// Calls a function once per second of this process's own time: seconds during which the machine was suspended do not
+/// count.
 class Sweeper {
  public:
   explicit Sweeper(const Loop& loop) : loop_(loop), last_(loop.now()) {}
 
-  /// To be called before every turn of the loop, which comes at least once a second.
+  /// Call it before every turn of the loop, at least once a second.
   template <class Sweep>
   void turn(Sweep sweep) {
     if (loop_.now() - last_ < std::chrono::seconds(1)) return;

@@ -14,7 +14,7 @@ namespace {
 
 const char* name_of(Rounding codes) { return codes == Rounding::int4 ? "int4" : "int8"; }
 
-/// The steps of `calibrate`, and what they share.
+/// The steps of `calibrate` and their common state.
 class Calibration {
  public:
   Calibration(const std::string& from, std::string to, std::span<const Judged> observations,
@@ -70,7 +70,7 @@ class Calibration {
     std::filesystem::remove(file, ignored);
   }
 
-  /// How far the chunks are moved by one kind of codes alone.
+  /// How far one kind of codes alone moves the chunks.
   Result<Moved> moved_by(const std::string& bundle, Rounding codes) {
     const std::string trial = to_ + ".trial";
     if (const auto made = quantize(bundle, trial, all_as(codes), {}, [](QuantizeProgress) {}); !made)
@@ -100,7 +100,7 @@ class Calibration {
   const EngineOptions& options_;
   const std::function<void(QuantizeProgress)>& report_;
   Chunks expected_;                  // in float32
-  std::optional<Moved> int4_moves_;  // by int4 of `made_.bundle` as `quantize` makes it alone
+  std::optional<Moved> int4_moves_;  // by the plain int4 codes of `made_.bundle`
   Calibrated made_;
 };
 

@@ -6,17 +6,17 @@
 
 namespace vla {
 
-/// A policy made ready for codes by what its matrices multiply.
+/// A policy prepared for quantization by what its matrices multiply.
 struct Calibrated {
-  std::string bundle;  // the file that codes are made of: the smoothed one, or the one that was given
-  std::string int4;    // the file of it with int4 codes that make each other's errors good; empty where none is better
-  std::string why;     // what was done, for `quantize`; empty where nothing was
+  std::string bundle;  // the file to quantize: the smoothed one or the given one
+  std::string int4;  // the same with int4 codes that compensate each other's errors; empty if plain codes are better
+  std::string why;  // what was done, for `quantize`; empty if nothing
   std::vector<std::string> told;  // what was tried
 };
 
-/// Tries smoothing (smoothing.h) for matrices in `codes`, then codes of int4 by Hessians (hessians.h) where `has_int4`,
-/// and keeps what moves the chunks of the observations less. It writes to `to` with an ending, and leaves what it keeps
-/// there. `options`: of the engines. Errors: those of `smooth`, Hessians and `quantize`.
+/// Tries smoothing (smoothing.h) for matrices in `codes`, then int4 codes by Hessians (hessians.h) if `has_int4`, and
+/// keeps what moves the observations' chunks less. Its files are `to` plus an ending. `options`: of the engines.
+/// Errors: those of `smooth`, Hessians and `quantize`.
 Result<Calibrated> calibrate(const std::string& from, const std::string& to, Rounding codes, bool has_int4,
                              std::span<const Judged> observations, const EngineOptions& options,
                              const std::function<void(QuantizeProgress)>& report);

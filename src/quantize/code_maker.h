@@ -13,12 +13,12 @@ constexpr std::int64_t kPartRows = 64;  // of a matrix that are in memory at a t
 /// Makes the codes of a matrix, some rows at a time.
 class CodeMaker {
  public:
-  /// The codes of `wanted`: int8 or int4. Errors: those of `int4`.
+  /// Makes codes of `wanted`: int8 or int4. Errors: those of `int4`.
   static Result<CodeMaker> open(const Bundle& bundle, const TensorInfo& matrix, const Encoding& wanted,
                                 const Int4Codes& int4);
 
-  /// Codes of `n` rows from `first` on, of which `stored` are the bytes. They stay until the next call; scales [n].
-  /// Errors: bad_bundle, of Int4Codes::made.
+  /// Codes of `n` rows starting at `first`, whose bytes are `stored`. Codes and scales [n] are valid until the next
+  /// call. Errors: bad_bundle, for Int4Codes::made.
   Result<const std::byte*> make(const std::byte* stored, std::int64_t first, std::int64_t n, float* scales);
 
  private:

@@ -10,10 +10,10 @@
 namespace vla {
 namespace {
 
-constexpr std::int64_t kMaxRows = 128;  // of one value: tokens of an image say nearly the same
-constexpr double kDamping = 0.01;       // of the mean square of a column is added to all: GPTQ's percdamp
+constexpr std::int64_t kMaxRows = 128;  // rows kept of one value: tokens of an image are much alike
+constexpr double kDamping = 0.01;  // share of the columns' mean square that is added to all: GPTQ's percdamp
 
-/// Calls f(first column, columns, offset of the stretch's matrix).
+/// Calls f(first column, columns, offset of the stretch's matrix) for each stretch.
 template <class F>
 void each_stretch(std::int64_t d, F f) {
   for (std::int64_t first = 0, offset = 0; first < d; first += kernels::kStretch) {
@@ -29,18 +29,18 @@ double dot(const double* a, const double* b, std::int64_t n) {
   return sum;
 }
 
-/// M of H = M Mᵀ, upper triangular, from the upper triangle of H: column by column, the last one first.
+/// Computes M of H = M Mᵀ, upper triangular, from H's upper triangle, from the last column to the first.
 std::vector<double> factor(const float* h, std::int64_t n) {
   std::vector<double> m(static_cast<std::size_t>(n * n));
   double trace = 0;
   for (std::int64_t k = 0; k < n; ++k) trace += h[k * n + k];
   const double damping = kDamping * trace / static_cast<double>(n);
   for (std::int64_t k = n - 1; k >= 0; --k) {
-    const double* const right = &m[static_cast<std::size_t>(k * n + k + 1)];  // of what is already known in row k
+    const double* const right = &m[static_cast<std::size_t>(k * n + k + 1)];  // what is known of row k so far
     const std::int64_t n_right = n - k - 1;
     const double square = h[k * n + k] + damping - dot(right, right, n_right);
     const double diagonal = std::sqrt(std::max(square, damping));
-    if (diagonal == 0) continue;  // nothing was ever multiplied
+    if (diagonal == 0) continue;  // this column was never multiplied by anything but zeros
     for (std::int64_t j = 0; j < k; ++j)
       m[static_cast<std::size_t>(j * n + k)] =
           (h[j * n + k] - dot(&m[static_cast<std::size_t>(j * n + k + 1)], right, n_right)) / diagonal;

@@ -8,19 +8,18 @@
 
 namespace vla {
 
-/// How an error in one column of a matrix is made good by those behind it, from the rows x that the matrix multiplies.
-/// A row of the matrix that misses e moves its products by e H e, where H = Σ x xᵀ is the Hessian, in squares. With
-/// H = M Mᵀ and M upper triangular that is Σ_k M_kk² (e_k + Σ_{j<k} e_j M_jk / M_kk)², so what was missed in column j
-/// asks of column k for M_jk / M_kk more. Sources: GPTQ (arXiv 2210.17323), in the form that QuIP (arXiv 2307.13304)
-/// gives it.
+/// How later columns of a matrix can compensate an error in an earlier one, given the rows x that the matrix
+/// multiplies. An error e of a matrix row changes its products by e H e in squares, where H = Σ x xᵀ is the Hessian.
+/// With H = M Mᵀ and M upper triangular this is Σ_k M_kk² (e_k + Σ_{j<k} e_j M_jk / M_kk)², so column k compensates
+/// column j's error by M_jk / M_kk times it. Sources: GPTQ (arXiv 2210.17323), in the form of QuIP (arXiv 2307.13304).
 class Hessian {
  public:
-  /// Of rows with `d` elements.
+  /// For rows of `d` elements.
   explicit Hessian(std::int64_t d);
 
-  /// Rows one after the other. Of many, some that are evenly spread.
+  /// Adds rows; of many it takes evenly spaced ones.
   void add(std::span<const float> rows);
-  /// What kernels::quantize_weights takes.
+  /// The weights that kernels::quantize_weights takes.
   std::vector<float> feedback() &&;
 
   /// Bytes of one.
@@ -28,7 +27,7 @@ class Hessian {
 
  private:
   std::int64_t d_;
-  std::vector<float> sums_;  // of stretches of columns (kernels::kStretch), one after the other
+  std::vector<float> sums_;  // for each stretch of columns (kernels::kStretch) its matrix
 };
 
 }  // namespace vla

@@ -9,7 +9,7 @@
 namespace vla {
 namespace {
 
-/// Of the Hessians that are in memory at a time.
+/// Memory for Hessians at a time.
 std::size_t most_bytes(std::size_t budget) {
   constexpr std::size_t kMost = std::size_t{1} << 30;
   return budget > 0 ? std::min(kMost, budget / 4) : kMost;
@@ -29,7 +29,7 @@ Result<Hessians> Hessians::of(const std::string& bundle, std::span<const Judged>
   return hessians;
 }
 
-/// Null where not all are known.
+/// Null if not all of them are known.
 const std::set<std::string>* Hessians::inputs_of(const Bundle& bundle, const TensorInfo& tensor) const {
   const auto found = inputs_.find(bundle.offset(tensor.data.data()));
   return found != inputs_.end() ? &found->second : nullptr;
@@ -44,7 +44,7 @@ Result<std::span<const float>> Hessians::feedback(const Bundle& bundle, const Te
   return std::span<const float>(feedback_.at(*paths));
 }
 
-/// Measures for this tensor and as many behind it as there is room for.
+/// Measures the Hessians for this tensor and for as many after it as fit in memory.
 Status Hessians::measure(const Bundle& bundle, const TensorInfo& first) {
   feedback_.clear();
   std::map<std::set<std::string>, Hessian> sums;

@@ -11,18 +11,17 @@
 
 namespace vla {
 
-/// The Hessians of a bundle's matrices, from what they multiply in the acts of some observations. Those of as many
-/// matrices as a gigabyte or a quarter of the budget holds are measured at a time, so matrices are best asked for in
-/// the file's order.
+/// The Hessians of a bundle's matrices, measured in the acts of some observations. As many as fit into a gigabyte, or a
+/// quarter of the budget, are measured at a time, so ask for matrices in file order.
 class Hessians {
  public:
-  /// Finds what is multiplied. `observations` must outlive this. Errors: those of Engine.
+  /// Finds what each matrix multiplies. `observations` must outlive this. Errors: those of Engine.
   static Result<Hessians> of(const std::string& bundle, std::span<const Judged> observations, EngineOptions options);
 
-  /// What makes the errors of a matrix good, by its tensor's place in the file; empty where a value that it multiplies
-  /// has no path. It stays until another one is asked for. Errors: those of Engine.
+  /// The compensation for a matrix, by its tensor's offset in the file; empty if a value that it multiplies has no
+  /// path. Valid until the next call. Errors: those of Engine.
   Result<std::span<const float>> feedback(const Bundle& bundle, const TensorInfo& tensor);
-  /// Of the matrices that were asked for, those with an answer, and all.
+  /// How many of the matrices asked for had an answer, and how many were asked for.
   int n_known() const { return n_known_; }
   int n_asked() const { return n_asked_; }
 
@@ -35,8 +34,8 @@ class Hessians {
   std::string bundle_;
   std::span<const Judged> observations_;
   EngineOptions options_;
-  std::map<std::ptrdiff_t, std::set<std::string>> inputs_;        // by Bundle::offset; those that all have paths
-  std::map<std::set<std::string>, std::vector<float>> feedback_;  // by the paths of what is multiplied
+  std::map<std::ptrdiff_t, std::set<std::string>> inputs_;  // by Bundle::offset; matrices whose inputs all have paths
+  std::map<std::set<std::string>, std::vector<float>> feedback_;  // by the paths of the inputs
   int n_known_ = 0, n_asked_ = 0;
 };
 

@@ -11,11 +11,11 @@
 
 namespace vla {
 
-/// Whether a node gives some tokens of its operand, or all, with the same channels.
+/// Whether a node returns some or all tokens of its operand with the same channels.
 bool is_view_of_channels(const Node& node);
 
-/// The paths of the values that matrices multiply, by the bytes of the matrices' tensors; an empty one is that of a
-/// value without.
+/// The paths of the values that matrices multiply, by the address of the matrices' bytes. A value without a path has an
+/// empty one.
 using MatrixInputs = std::map<const std::byte*, std::set<std::string>>;
 /// Adds those of a graph.
 void add_inputs(const Graph& graph, MatrixInputs& to);

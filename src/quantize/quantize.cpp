@@ -40,7 +40,7 @@ struct Matrices {
   }
 };
 
-/// The large matrices that the policies of all robots read. Errors: bad_bundle, unsupported.
+/// The large matrices that any robot's policy reads. Errors: bad_bundle, unsupported.
 Result<Matrices> find_matrices(const Bundle& bundle, const Choice& choice) {
   Matrices matrices;
   std::vector<std::string> tags = bundle.embodiments();
@@ -58,7 +58,7 @@ Result<Matrices> find_matrices(const Bundle& bundle, const Choice& choice) {
   return matrices;
 }
 
-/// The squares of what a matrix is, and of what its codes miss.
+/// Sums of squares of a matrix, and of its codes' errors.
 struct Squares {
   double value = 0, missed = 0;
 
@@ -71,7 +71,7 @@ struct Squares {
   }
 };
 
-/// Writes the tensors, one after the other.
+/// Writes the tensors in order.
 class Writer {
  public:
   Writer(const Bundle& bundle, const Int4Codes& int4, BundleFile& out,
@@ -82,7 +82,7 @@ class Writer {
     return out_.copy(bundle_, tensor, [this](std::size_t size) { tell(size); });
   }
 
-  /// Codes, then scales: two tensors.
+  /// Writes two tensors: codes, then scales.
   Result<Squares> quantize(const TensorInfo& tensor, const Encoding& wanted) {
     const std::int64_t d_in = tensor.shape[0], d_out = tensor.shape[1];
     const std::size_t row = tensor.data.size() / static_cast<std::size_t>(d_out);
@@ -130,7 +130,7 @@ std::int64_t quantized_size(const TensorInfo& tensor, const Encoding& encoding) 
   return static_cast<std::int64_t>(encoding.size(tensor.count()) + scales);
 }
 
-/// The tensors of the quantized file; of their data only the sizes count.
+/// Lists the tensors of the quantized file; only the sizes of their data are used.
 std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& matrices) {
   std::vector<TensorInfo> tensors;
   for (const TensorInfo& tensor : bundle.tensors()) {
@@ -142,7 +142,7 @@ std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& 
     codes.data = tensor.data.first(wanted->size(tensor.count()));
     codes.shape[0] = static_cast<std::int64_t>(dtype_size(wanted->type, codes.shape[0]));
     const std::int64_t d_out = tensor.shape[1];
-    // No bundle has a matrix with rows of fewer bytes than a scale.
+    // Every matrix row in a bundle has more bytes than a scale.
     tensors.push_back(
         {scales_name(tensor.name, *wanted), DType::f32, {d_out}, tensor.data.first(dtype_size(DType::f32, d_out))});
   }
@@ -159,7 +159,7 @@ Keys quantized_keys(const Bundle& bundle, const Matrices& matrices, const std::s
   return keys;
 }
 
-/// A row of the report for every module, in the order of the file.
+/// One row of the report per module, in file order.
 class Report {
  public:
   QuantizedModule& of(const TensorInfo& tensor) {

@@ -11,7 +11,7 @@
 namespace vla {
 namespace {
 
-/// `vision.blk.3` of `vision.blk.3.attn_q.weight`; the first level of a path without a number.
+/// The block of a tensor: `vision.blk.3` for `vision.blk.3.attn_q.weight`; the first level of a path without a number.
 std::string block_of(const std::string& tensor) {
   for (std::size_t end = tensor.find('.'); end != std::string::npos; end = tensor.find('.', end + 1)) {
     const std::size_t digits = tensor.find_first_not_of("0123456789", end + 1);
@@ -35,7 +35,7 @@ std::int64_t bytes_of(const Block& block) {
   return block.codes == Rounding::int4 ? block.int4 : block.codes == Rounding::int8 ? block.int8 : block.stored;
 }
 
-/// Squares, so that those of several blocks add.
+/// Squares, because the errors of blocks add in squares.
 double beyond(double larger, double smaller) { return std::sqrt(std::max(0.0, larger * larger - smaller * smaller)); }
 
 class Search {
@@ -64,7 +64,7 @@ class Search {
     set_all(Rounding::int4);
     found_.moved = found_.all_int4;
     while (found_.moved.rms > most) {
-      // Where a choice misses more than was expected of it, less must be expected of the next one.
+      // If a choice misses the bound by more than expected, the next one must aim lower.
       VLA_TRY(const bool given, give_back_until(most * std::min(1.0, expected() / found_.moved.rms)));
       if (!given)
         return Error{Code::unsupported, "--error", fmt::format("{:.3g} or more", found_.moved.rms),
@@ -120,7 +120,7 @@ class Search {
     return result;
   }
 
-  /// Bytes of the file with the codes of the blocks.
+  /// Bytes of the file with these codes per block.
   std::int64_t size() const {
     std::int64_t size = n_byte_;
     for (const Block& block : found_.blocks) size += bytes_of(block) - block.stored;
@@ -140,7 +140,7 @@ class Search {
   }
   static void give_back(Block& block) { block.codes = block.codes == Rounding::int4 ? Rounding::int8 : Rounding::none; }
 
-  /// The block whose next larger codes spare the actions most for their bytes. Null where none is left.
+  /// The block where the next larger codes reduce the error most per byte. Null if none is left.
   Result<Block*> next(const std::function<bool(const Block&)>& fits) {
     std::vector<Block*> candidates;
     for (Block& block : found_.blocks)
@@ -152,7 +152,7 @@ class Search {
     VLA_CHECK(measure_int8());
     return next(fits);
   }
-  /// Whether there was anything to give back.
+  /// Enlarges the codes of the best blocks until the expected error is at most `most`. Whether any block changed.
   Result<bool> give_back_until(double most) {
     for (bool given = false;; given = true) {
       VLA_TRY(Block* const block, next([](const Block&) { return true; }));
@@ -193,7 +193,7 @@ class Search {
   const EngineOptions& options_;
   const Int4Codes& int4_;
   const Report& report_;
-  std::int64_t n_byte_ = 0;  // of the file as it is
+  std::int64_t n_byte_ = 0;  // bytes of the unquantized file
   bool knows_int8_ = false;
   Chunks expected_;
   Found found_;

@@ -22,7 +22,7 @@ namespace {
 // than activations of eight gain.
 constexpr int kLeastPower = 2, kMostPower = 12;
 
-/// The largest magnitude of each channel of a value, over tokens, solver steps and observations.
+/// The largest magnitude of each channel of a value over tokens, solver steps and observations.
 using Ranges = std::map<std::string, std::vector<float>>;
 
 void widen_range(std::vector<float>& range, std::size_t d, std::span<const float> values) {
@@ -31,7 +31,7 @@ void widen_range(std::vector<float>& range, std::size_t d, std::span<const float
     for (std::size_t k = 0; k < d; ++k) range[k] = std::max(range[k], std::abs(values[i + k]));
 }
 
-/// `chunks`: receives those of the observations.
+/// `chunks` receives the observations' chunks.
 Result<Ranges> measure_ranges(const std::string& bundle, const std::vector<SmoothingPlace>& places,
                               std::span<const Judged> observations, EngineOptions options, Chunks& chunks) {
   Ranges ranges;
@@ -44,17 +44,17 @@ Result<Ranges> measure_ranges(const std::string& bundle, const std::vector<Smoot
   return ranges;
 }
 
-/// Factors of rows and columns of a tensor; empty where all are 1. A vector is a row.
+/// Factors for rows and columns of a tensor; empty if all are 1. A vector counts as a row.
 struct Factors {
   std::vector<float> rows, columns;
 };
 
-/// Reads and writes tensors part by part, with factors.
+/// Reads and writes tensors part by part, applying factors.
 class Scaler {
  public:
   explicit Scaler(const Bundle& bundle) : bundle_(bundle) {}
 
-  /// Rows of a tensor as floats, for `see`.
+  /// Passes the rows of a tensor to `see` as floats.
   Status each_row(const TensorInfo& tensor, const std::function<void(std::int64_t row, std::span<float>)>& see) {
     const std::int64_t d = tensor.shape.front(), n_row = tensor.count() / d;
     const std::size_t row_size = dtype_size(tensor.type, d);
@@ -94,13 +94,13 @@ class Scaler {
   std::vector<float> row_;
 };
 
-/// The nearest one; 1 for what is not far from it.
+/// The nearest power of two, or 1 if the factor is small.
 float power_of_two(double value) {
   const int power = std::clamp(static_cast<int>(std::lround(std::log2(value))), -kMostPower, kMostPower);
   return std::abs(power) < kLeastPower ? 1 : std::ldexp(1.0f, power);
 }
 
-/// The divisors of channels, relative to the geometric mean of all, so that most channels stay as they are.
+/// The divisors of channels relative to the geometric mean of all, so that most channels stay unchanged.
 std::vector<float> divisors(const std::vector<float>& x, const std::vector<float>& w) {
   std::vector<double> ratios;
   double sum = 0;
@@ -121,7 +121,7 @@ void multiply(std::vector<float>& factors, const std::vector<float>& by, bool in
   for (std::size_t i = 0; i < by.size(); ++i) factors[i] *= inverse ? 1 / by[i] : by[i];
 }
 
-/// Factors of tensors by where they lie in the file, which robots of a bundle share.
+/// Factors by the tensors' place in the file, since robots of a bundle share tensors.
 class Scaling {
  public:
   Scaling(const Bundle& bundle, const Bundle& opened) : opened_(opened), scaler_(bundle) {
@@ -157,7 +157,7 @@ class Scaling {
     return *by_offset_.at(opened_.offset(param->source->data.data()));
   }
 
-  const Bundle& opened_;  // whose parameters these are
+  const Bundle& opened_;  // the bundle that owns the parameters
   Scaler scaler_;
   std::map<std::ptrdiff_t, const TensorInfo*> by_offset_;
   std::map<const TensorInfo*, Factors> factors_;

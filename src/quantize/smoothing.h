@@ -6,12 +6,12 @@
 
 namespace vla {
 
-/// The extent of a smoothing, and what it was measured by.
+/// How much was smoothed, and what it was measured by.
 struct Smoothed {
-  int n_place = 0;    // norms and gated MLPs whose matrices all are floats and read nothing else
-  int n_channel = 0;  // of them that were divided
+  int n_place = 0;  // norms and gated MLPs that only matrices of floats read
+  int n_channel = 0;  // how many of them were divided
   float largest = 1;  // factor
-  Chunks chunks;      // of the observations, in float32
+  Chunks chunks;  // the observations' chunks in float32
 };
 
 /// Writes a bundle of the same function whose activations and matrices lose less when they become codes. Where a

@@ -18,7 +18,7 @@ Readers readers_of(const Graph& graph) {
   return readers;
 }
 
-/// The products that read a value, also through views of it. False where something else does.
+/// Collects the products that read a value, also through views. False if anything else reads it.
 bool find_products(const Node& value, const Readers& readers, std::vector<const Node*>& products) {
   const auto found = readers.find(&value);
   if (found == readers.end()) return true;
@@ -36,14 +36,14 @@ const Param* parameter_of(const Tensor& tensor) {
   return leaf != nullptr ? leaf->param : nullptr;
 }
 
-/// `up` of a product of a gate and `up`, which alone reads it; else null.
+/// Returns `up` of the product gate * up if nothing else reads it; else null.
 const op::Linear* up_of(const Node& node, const Readers& readers) {
   if (node.as<op::Multiply>() == nullptr || node.in[0].shape() != node.in[1].shape()) return nullptr;
   const Node& up = *node.in[1].node();
   return readers.at(&up).size() == 1 ? up.as<op::Linear>() : nullptr;
 }
 
-/// Scaling by powers of two loses no digit of these.
+/// Dtypes that scaling by powers of two does not round.
 bool has_exponents(const Param& matrix) {
   return matrix.encoding.type == DType::f32 || matrix.encoding.type == DType::bf16;
 }
@@ -52,7 +52,7 @@ bool has_exponents(const Param& matrix) {
 
 void SmoothingPlaces::see(const Graph& graph) {
   const Readers readers = readers_of(graph);
-  std::map<const Node*, const Param*> read_from, rows_of;  // of products: the weight of their place
+  std::map<const Node*, const Param*> read_from, rows_of;  // for products the weight of their place
   for (const Node& node : graph.nodes()) {
     SmoothingPlace place = {.path = node.path};
     if (node.as<op::Norm>() != nullptr && node.in.size() > 1) {

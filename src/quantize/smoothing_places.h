@@ -11,12 +11,12 @@
 
 namespace vla {
 
-/// A place where channels may be divided, since all its readers multiply them by matrices that can be multiplied: the
-/// result of a norm with weights, or of a gated MLP before `down`.
+/// A place where channels can be divided, because every reader is a matrix whose columns can be multiplied: the result
+/// of a norm with weights, or a gated MLP's value before `down`.
 struct SmoothingPlace {
-  std::string path;               // of the value's tap
-  const Param* weight = nullptr;  // of the norm, or of the MLP's `up`, whose rows are divided
-  const Param* bias = nullptr;    // is divided too; may be null
+  std::string path;  // path of the value's tap
+  const Param* weight = nullptr;  // weight of the norm or of the MLP's `up`, whose rows are divided
+  const Param* bias = nullptr;  // its bias, divided too; may be null
   std::set<const Param*> readers;
 };
 
@@ -24,16 +24,16 @@ struct SmoothingPlace {
 class SmoothingPlaces {
  public:
   void see(const Graph& graph);
-  /// Those that hold in every graph: parameters that something else reads too are no place's.
+  /// The places that hold in every graph. A place whose parameters something else reads is dropped.
   std::vector<SmoothingPlace> found() const;
 
  private:
-  /// The roles of a parameter's elements in the operations that read it: by the weight of the place, null for others.
+  /// How operations use a parameter's elements: for each the weight of the place, null for other uses.
   using Uses = std::map<const Param*, std::set<const Param*>>;
 
   std::map<const Param*, SmoothingPlace> places_;  // by weight
   std::set<const Param*> refused_;                 // weights
-  Uses columns_, rows_;                            // of matrices by place; of vectors only rows
+  Uses columns_, rows_;  // for matrices by place; for vectors only rows
 };
 
 }  // namespace vla
