@@ -10,11 +10,11 @@
 
 namespace vla::kernels {
 
-/// Rows of d_head elements: which one is the first, and how many from one head, token or batch to the next.
+/// Rows of d_head elements: the first one, and the strides between heads, tokens and batches.
 struct HeadRows {
   const std::byte* data;
   std::int64_t first, head, token, batch;
-  /// The layout of bf16 elements, in rows of `d`; none: floats.
+  /// Layout of bf16 elements in rows of `d`; none: floats.
   RoundedLayout layout = RoundedLayout::none;
   std::int64_t d = 0;
 
@@ -26,7 +26,7 @@ struct HeadRows {
   }
 };
 
-/// Keys and values that are laid out as attention reads them. A unit is one head of keys and values, of one batch.
+/// Keys and values in the layout that attention reads. A unit is one head of keys and values in one batch.
 struct PackJob {
   std::int64_t d_head, n_head_kv, n_key, n_batch;
   HeadRows k, v;
@@ -36,13 +36,13 @@ struct PackJob {
   std::int64_t n_unit() const { return n_head_kv * n_batch; }
 };
 
-/// One attention: sizes and addresses.
+/// Sizes and addresses of one attention.
 struct AttentionJob {
-  /// Packed keys and values that stand one after the other.
+  /// A segment of packed keys and values.
   struct Segment {
     const std::byte* packed;
     std::int64_t n_key;
-    std::int64_t first = 0;  // keys of the segments before it
+    std::int64_t first = 0;  // keys in earlier segments
   };
   static constexpr int kMaxSegment = 6;
 
@@ -50,35 +50,35 @@ struct AttentionJob {
   float scale;
   HeadRows q;
   RowPrep prep;       // of queries
-  const float* mask;  // [n_key, n_query] of any values but +infinity, or null
+  const float* mask;  // [n_key, n_query], any values except +infinity, or null
   int n_segment;
   Segment segment[kMaxSegment];
   std::byte* out;  // floats [d_head, n_head, n_query, n_batch], or bf16 in out_layout
   RoundedLayout out_layout = RoundedLayout::none;
   std::int64_t block_rows;  // made by AttentionKernel::cut
 
-  /// Query heads that share keys and values: their queries are rows of one and the same product.
+  /// Query heads per key head. Their queries are rows of the same product.
   std::int64_t n_row() const { return n_head / n_head_kv * n_query; }
   std::int64_t n_unit() const { return n_head_kv * n_batch; }
 };
 
-/// Attention for one instruction set: softmax(q k * scale + mask) v in float32, heads concatenated, without a matrix of
-/// scores in memory. Chunks of keys that a block of queries sees nothing of (-infinity all over) are skipped. Another
-/// arithmetic (bf16 tiles) is another row.
+/// Attention for one instruction set: softmax(q k * scale + mask) v in float32, heads concatenated, without a score
+/// matrix in memory. It skips chunks of keys that are masked for a whole block of queries. Other arithmetics, such as
+/// bf16 tiles, are other rows of the table.
 struct AttentionKernel {
-  /// Bytes that packed keys and values take.
+  /// Bytes of packed keys and values.
   std::size_t (*packed_size)(const PackJob& job);
   std::int64_t (*n_pack)(const PackJob& job);
   void (*pack)(const PackJob& job, std::int64_t item);
-  /// Cuts a job into items for so many threads, and says how many there are.
+  /// Splits a job into items for that many threads. Returns how many.
   std::int64_t (*cut)(AttentionJob& job, int n_thread);
   void (*run)(const AttentionJob& job, std::int64_t item);
-  /// How `out` may lie instead of float32 rows, its rows a multiple of kTileSide long; and queries, keys and values to
-  /// which nothing is done first.
+  /// The layout that `out` may have in place of float32 rows, with rows a multiple of kTileSide long; and the layout
+  /// that unprocessed queries, keys and values may have.
   RoundedLayout rounded;
 };
 
-/// Heads wider than this have no kernel.
+/// The widest head that has a kernel.
 constexpr std::int64_t kMaxHead = 256;
 
 }  // namespace vla::kernels

@@ -7,8 +7,8 @@
 
 namespace vla::kernels {
 
-/// Packed keys and values as the products read them: for each unit panels of keys, whose depth is the width of a head,
-/// and behind them panels of features, whose depth is the number of keys. `P` is a type of attention_products.h.
+/// Packed keys and values as the products read them. A unit has panels of keys, whose depth is the head's width,
+/// followed by panels of features, whose depth is the number of keys. `P` is a type of attention_products.h.
 template <class P>
 class AttentionPanels {
   using V = typename P::Vector;
@@ -25,16 +25,16 @@ class AttentionPanels {
         d_value(round_up(head, P::kMinPanel)) {}
 
   const std::int64_t d_head;
-  const std::int64_t n_key;      // keys with those that fill the last panel
-  const std::int64_t key_depth;  // elements of a key, with what fills up the depth
-  const std::int64_t d_value;    // columns of all panels of features
+  const std::int64_t n_key;  // keys, padded to whole panels
+  const std::int64_t key_depth;  // elements of a key, padded to whole steps
+  const std::int64_t d_value;  // columns in all panels of features
 
-  /// Elements that one unit takes.
+  /// Elements in one unit.
   std::int64_t unit_size() const { return n_key * (key_depth + d_value); }
-  /// The offsets of a unit's keys, and of its values.
+  /// Offsets of a unit's keys and of its values.
   std::int64_t keys(std::int64_t unit) const { return unit * unit_size(); }
   std::int64_t values(std::int64_t unit) const { return keys(unit) + n_key * key_depth; }
-  /// Columns of the panel of features that starts at feature i.
+  /// Columns in the panel of features that starts at feature i.
   std::int64_t width(std::int64_t i) const { return d_value - i < kPanel ? P::kMinPanel : kPanel; }
 
   static std::size_t packed_size(const PackJob& job) {
@@ -53,8 +53,7 @@ class AttentionPanels {
       P::put_values(rows + i, first, panels.width(i), packed + panels.values(unit) + i * panels.n_key);
   }
 
-  /// The d_head elements of a token, and zeros up to `n_padded`. What follows them in steps of two vectors is written
-  /// too.
+  /// Writes a token's d_head elements, padded with zeros to `n_padded`. It may write up to two vectors further.
   VLA_INLINE void copy_row(const HeadRows& rows, std::int64_t head, std::int64_t token, std::int64_t batch,
                            const RowPrep& prep, std::int64_t n_padded, Number* to) const {
     if constexpr (P::kRounded != RoundedLayout::none)
@@ -76,7 +75,7 @@ class AttentionPanels {
     const auto* from = reinterpret_cast<const Number*>(rows.data);
     for_pieces(P::kRounded, place / rows.d, place % rows.d, d_head, rows.d,
                [&](std::int64_t i, std::int64_t at, std::int64_t n) VLA_LAMBDA {
-                 if (n == kTileSide)  // a size that the compiler knows
+                 if (n == kTileSide)  // a compile-time size
                    std::memcpy(to + i, from + at, kTileSide * sizeof(*to));
                  else
                    std::memcpy(to + i, from + at, static_cast<std::size_t>(n) * sizeof(*to));
@@ -84,8 +83,8 @@ class AttentionPanels {
     if (d_head < n_padded) std::memset(to + d_head, 0, static_cast<std::size_t>(n_padded - d_head) * sizeof(*to));
   }
 
-  /// Keys or values of kPanel tokens from `first` on, as elements and padded to `n_padded`; missing tokens are zeros.
-  /// The next tokens are prefetched: they are too far apart for the hardware prefetcher.
+  /// Reads keys or values of kPanel tokens, starting at `first`, as elements padded to `n_padded`; missing tokens are
+  /// zeros. It prefetches the next tokens, which are too far apart for the hardware prefetcher.
   VLA_INLINE void copy_rows(const PackJob& job, const HeadRows& from, const RowPrep& prep, std::int64_t unit,
                             std::int64_t first, std::int64_t n_padded, Number* rows) const {
     const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv;

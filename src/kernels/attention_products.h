@@ -5,31 +5,30 @@
 #include "kernels/attention_kernel.h"
 #include "kernels/math.h"
 
-/// The arithmetics that attention computes in: float32, pairs of bf16 by vector instructions, pairs of bf16 by tiles.
-/// Both products of attention have the same form: rows of elements times panels, which hold every column's element for
-/// each step of the depth.
+/// The arithmetics of attention: float32, pairs of bf16 with vector instructions, pairs of bf16 with tiles. Both
+/// products of attention multiply rows by panels, which hold every column's element for each step of the depth.
 namespace vla::kernels {
 
-/// From one row of a block to the next, where a row may have n elements: a little apart from powers of two, so that
-/// rows do not compete for the same lines of the cache.
+/// The stride of block rows with up to n elements. It avoids powers of two, so that rows do not compete for the same
+/// cache lines.
 constexpr int row_stride(int n) { return n + 32; }
 constexpr int kHeadStride = row_stride(kMaxHead);
 
-/// Float32: kRowsOfTile rows times two vectors, one operand broadcast. `V` is a type of vec.h.
+/// Float32: kRowsOfTile rows by two vectors, one operand broadcast. `V` is a type of vec.h.
 template <class V, int kRowsOfTile, int kVectorsOfPanel = 2>
 struct FloatProducts {
   using Vector = V;
   using Float = typename V::Float;
   using Number = float;
   struct Session {};
-  static constexpr int kTile = kRowsOfTile, kRows = 24, kPart = kRows;  // rows of a tile, of a block, of a pass
+  static constexpr int kTile = kRowsOfTile, kRows = 24, kPart = kRows;  // rows of a tile, a block, a pass
   static constexpr int kKeys = 128;                                     // of a chunk
   static constexpr int kVectors = kVectorsOfPanel, kPanel = kVectors * V::width;
-  static constexpr int kMinPanel = V::width, kDepth = 1;  // columns; unit of the depth
+  static constexpr int kMinPanel = V::width, kDepth = 1;  // columns of a panel; unit of the depth
   static constexpr bool kBeside = false;
   static constexpr RoundedLayout kRounded = RoundedLayout::none;
 
-  /// Weights are e^x, and relative to the greatest score of their row.
+  /// Weights are e^x, relative to the largest score of their row.
   static constexpr float kLogOfE = 1, kSlack = 0;
   static VLA_INLINE Float power(Float x) { return exp_of_negative<V>(x); }
 
@@ -39,7 +38,7 @@ struct FloatProducts {
     V::store(to + V::width, b);
   }
 
-  /// Rows become the columns of a panel.
+  /// Transposes rows into the columns of a panel.
   static VLA_INLINE void put_keys(const Number* rows, std::int64_t depth, Number* panel) {
     for (std::int64_t k = 0; k < depth; k += V::width)
       for (int n = 0; n < kPanel; n += V::width) {
@@ -51,7 +50,7 @@ struct FloatProducts {
       }
   }
 
-  /// kPanel rows become as many steps of the depth, from `k` on, of a panel of `width` columns.
+  /// Copies kPanel rows as steps of the depth, starting at `k`, of a panel of `width` columns.
   static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t width, Number* panel) {
     for (int i = 0; i < kPanel; ++i) {
       const Number* row = rows + i * kHeadStride;
@@ -61,9 +60,10 @@ struct FloatProducts {
     }
   }
 
-  /// Products, each done at once.
+  /// Products that are computed immediately.
   struct Work {
-    /// c = a * panel, or c += where `sum`. a [depth, kTile] and c [width, kTile], rows `kStrideA` and `kStrideC` apart.
+    /// c = a * panel, or c += a * panel if `sum`. a [depth, kTile] and c [width, kTile], with row strides `kStrideA`
+    /// and `kStrideC`.
     template <int kStrideA, int kStrideC>
     VLA_INLINE void add(const float* a, const float* panel, std::int64_t depth, std::int64_t width, float* c,
                         bool sum) {
@@ -99,7 +99,8 @@ struct FloatProducts {
   }
 };
 
-/// Elements rounded to bf16, sums in float32, and how panels hold them. `Pairs` rounds two vectors: store(to, a, b).
+/// Elements rounded to bf16 with sums in float32, and how panels store them. `Pairs` rounds two vectors: store(to, a,
+/// b).
 template <class V, class Pairs>
 struct PairPanels {
   using Vector = V;
@@ -107,20 +108,20 @@ struct PairPanels {
   using Number = std::uint16_t;
   static constexpr int kPanel = 32, kMinPanel = 32, kDepth = 32;
 
-  /// Weights are 2^x. Rounding errs by a share of a weight, so that weights may as well be up to 2^kSlack: then the
-  /// greatest score of a row seldom moves far enough to scale down what was mixed before.
+  /// Weights are 2^x. Rounding errors are relative, so weights may be as large as 2^kSlack: then a row's largest score
+  /// rarely rises enough to rescale the output.
   static constexpr float kLogOfE = 1.44269504f, kSlack = 8;
   static VLA_INLINE Float power(Float x) { return exp2_for_bf16<V>(x); }
 
-  /// The place of element `k` of column `n` in a panel: for each 32 of the depth two tiles of 16 columns; in each of
-  /// their 16 lines a pair of every column.
+  /// The place of element `k` of column `n` in a panel: two tiles of 16 columns for each 32 of the depth; each of a
+  /// tile's 16 lines has a pair of every column.
   static constexpr std::int64_t place(std::int64_t k, std::int64_t n) {
     return k / 32 * 1024 + n / 16 * 512 + k % 32 / 2 * 32 + n % 16 * 2 + k % 2;
   }
 
   static VLA_INLINE void store(Number* to, Float a, Float b) { Pairs::store(to, a, b); }
 
-  /// A pair of consecutive elements stays a word, so that a tile is the transpose of 16 rows of words.
+  /// A pair of consecutive elements is one word, so a tile is the transpose of 16 rows of words.
   static VLA_INLINE void put_keys(const Number* rows, std::int64_t depth, Number* panel) {
     for (std::int64_t k = 0; k < depth; k += 2 * V::width)
       for (int n = 0; n < kPanel; n += V::width) {
@@ -132,7 +133,7 @@ struct PairPanels {
       }
   }
 
-  /// The pairs are elements of consecutive rows here.
+  /// Here pairs are elements of two consecutive rows.
   static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t, Number* panel) {
     panel += place(k, 0);
     for (int i = 0; i < kPanel; i += 2)
@@ -156,8 +157,8 @@ struct PairPanels {
   static VLA_INLINE void store_words(Number* p, Float x) { std::memcpy(p, &x, sizeof(x)); }
 };
 
-/// A vector instruction adds the products of both elements of a pair: `Pairs` has add(sum, pairs, pairs). Rows of a
-/// tile times 32 columns, a pair of the row broadcast.
+/// A vector instruction adds both products of a pair: `Pairs` has add(sum, pairs, pairs). Rows of a tile by 32 columns;
+/// a pair of the row is broadcast.
 template <class V, int kRowsOfTile, class Pairs>
 struct VectorPairProducts : PairPanels<V, Pairs> {
   using Base = PairPanels<V, Pairs>;
@@ -168,9 +169,9 @@ struct VectorPairProducts : PairPanels<V, Pairs> {
   static constexpr bool kBeside = false;
   static constexpr RoundedLayout kRounded = RoundedLayout::rows;
 
-  /// Products, each done at once.
+  /// Products that are computed immediately.
   struct Work {
-    /// c = a * panel, or c += where `sum`.
+    /// c = a * panel, or c += a * panel if `sum`.
     template <int kStrideA, int kStrideC>
     VLA_INLINE void add(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c, bool sum) {
       constexpr int kVectors = Base::kPanel / V::width;
@@ -198,8 +199,8 @@ struct VectorPairProducts : PairPanels<V, Pairs> {
   };
 };
 
-/// 32 rows times 32 columns through a tile type (AMX, or its emulation) that holds the sums between `open` and `close`,
-/// adds 32 of the depth in each `step`, and rounds. Strides are elements from one row to the next.
+/// 32 rows by 32 columns through a tile type (AMX or its emulation) that holds the sums between `open` and `close`,
+/// adds 32 of the depth in each `step`, and rounds. Strides are in elements.
 template <class V, class Tile>
 struct PairProducts : PairPanels<V, Tile> {
   using Base = PairPanels<V, Tile>;
@@ -207,15 +208,14 @@ struct PairProducts : PairPanels<V, Tile> {
   using Session = typename Tile::Session;
   using Base::kDepth, Base::kPanel;
   static constexpr int kTile = 32, kRows = 64, kPart = 32, kKeys = 256;
-  static constexpr bool kBeside = true;  // products wait for other work to be done beside it
+  static constexpr bool kBeside = true;  // products are queued and computed beside other work
   static constexpr RoundedLayout kRounded = RoundedLayout::tiles;
 
-  /// Products that are done a step at a time between other work: while the vector instructions before and behind a
-  /// step wait for each other, the unit of the tiles, which is one of its own, computes. The processor looks some 500
-  /// instructions ahead, so that steps are short.
+  /// Queued products, computed a step at a time between other work: the tile unit runs while vector instructions wait
+  /// for each other. The processor looks about 500 instructions ahead, so steps are short.
   class Work {
    public:
-    /// c = a * panel, or c += where `sum`.
+    /// Queues c = a * panel, or c += a * panel if `sum`.
     template <int kStrideA, int kStrideC>
     VLA_INLINE void add(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c, bool sum) {
       waiting_[n_waiting_++] = {.a = a,
@@ -227,9 +227,9 @@ struct PairProducts : PairPanels<V, Tile> {
                                 .sum = sum};
       n_step_ += static_cast<int>(depth / kDepth);
     }
-    /// Steps of everything that was added since the last `finish`.
+    /// Steps of all products queued since the last `finish`.
     int n_step() const { return n_step_; }
-    /// Does the next n steps, or what there is.
+    /// Computes the next n steps, or all that are left.
     VLA_INLINE void advance(int n) {
       for (; n > 0 && first_ < n_waiting_; --n) {
         const Product& product = waiting_[first_];
@@ -253,7 +253,7 @@ struct PairProducts : PairPanels<V, Tile> {
       bool sum;
     };
     Product waiting_[kKeys / kPanel + kMaxHead / kPanel];
-    int n_waiting_ = 0, n_step_ = 0, first_ = 0, step_ = 0;  // step_: of the first that waits
+    int n_waiting_ = 0, n_step_ = 0, first_ = 0, step_ = 0;  // step_: within the first queued product
     Tile tile_;
   };
 };

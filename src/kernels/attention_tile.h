@@ -6,12 +6,12 @@
 
 #include "kernels/attention_panels.h"
 
-/// Attention with an online softmax. Rows of a block (queries of every head that shares keys) meet the keys in chunks:
-/// a chunk's scores lie in the L1 and L2 caches, become weights there, and are mixed into the block's output, which is
-/// scaled down whenever a much larger score turns up.
+/// Attention with an online softmax. A block's rows are the queries of every head that shares keys. They are multiplied
+/// by keys in chunks: a chunk's scores stay in the L1 and L2 caches, become weights there, and are added to the block's
+/// output. The output is rescaled whenever a much larger score appears.
 ///
-/// In one pass a part of the rows meets one chunk. Where the products have a unit of their own (P::kBeside), those of
-/// the passes before and behind are computed between the rows whose scores become weights.
+/// One pass computes some of the rows with one chunk. If products run on a unit of their own (P::kBeside), those of
+/// neighbouring passes are computed while vector instructions turn scores into weights.
 ///
 /// Source of the method: Dao et al., FlashAttention (2022); Milakov and Gimelshein, Online normalizer (2018).
 namespace vla::kernels {
@@ -26,7 +26,7 @@ class AttentionTile {
   static constexpr int kWidth = V::width, kTile = P::kTile, kPanel = P::kPanel;
   static constexpr int kRows = P::kRows;  // rows of a block, a multiple of kPart
   static constexpr int kPart = P::kPart;  // rows of a pass, a multiple of kTile
-  static constexpr int kKeys = P::kKeys;  // keys of a chunk, a multiple of kPanel
+  static constexpr int kKeys = P::kKeys;  // keys in a chunk, a multiple of kPanel
   static constexpr int kKeyStride = row_stride(kKeys);
   static constexpr float kNever = -std::numeric_limits<float>::infinity();
   static_assert(kRows % kPart == 0 && kPart % kTile == 0 && kKeys % kPanel == 0);
@@ -45,7 +45,7 @@ class AttentionTile {
 
  private:
   static std::int64_t cut(AttentionJob& job, int n_thread) {
-    // Blocks are made smaller where there would be too few of them to share out.
+    // Makes blocks smaller if there are too few for all threads.
     const std::int64_t fair = round_up(job.n_row() * job.n_unit() / (4 * n_thread) + 1, kTile);
     job.block_rows = min(fair, kRows);
     return ceil_div(job.n_row(), job.block_rows) * job.n_unit();
@@ -57,7 +57,7 @@ class AttentionTile {
     Block(job, item / n_block, row, static_cast<int>(min(job.n_row() - row, job.block_rows))).run();
   }
 
-  /// At most kRows rows of one unit.
+  /// A block: at most kRows rows of one unit.
   struct Block {
     const AttentionJob& job;
     const std::int64_t unit, batch;
@@ -67,15 +67,15 @@ class AttentionTile {
     std::int64_t head[kRows], query[kRows];  // of each row
     typename P::Work work;
     alignas(64) float mixed[kRows * kHeadStride];
-    // Of one pass, or of two where the next one's products are computed beside the weights of one.
+    // State of one pass; of two, if the products of the next are computed beside the weights of this one.
     static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kPart * kKeyStride;
-    // Scores, and weights in their place. Those of rows that no query has are anything: they are multiplied too, into
-    // rows that are not read.
+    // Scores, later weights in the same place. Rows without a query have arbitrary values; their products go to rows
+    // that are not read.
     alignas(64) float score[kBuffers * kBufferSize];
     alignas(64) Number query_number[kRows * kHeadStride];
-    static constexpr int kRowVectors = round_up(kRows, kWidth);  // room for whole vectors
-    alignas(64) float sum[kRowVectors * kWidth];                 // of a row's weights, lane by lane
-    // One number for each row; weights are relative to the score `base`.
+    static constexpr int kRowVectors = round_up(kRows, kWidth);  // padded to whole vectors
+    alignas(64) float sum[kRowVectors * kWidth];  // sum of a row's weights, lane by lane
+    // One value per row; weights are relative to the score `base`.
     alignas(64) float base[kRowVectors], minus_offset[kRowVectors], shrink[kRowVectors];
 
     VLA_INLINE Block(const AttentionJob& j, std::int64_t i, std::int64_t first_row, int n)
@@ -89,14 +89,14 @@ class AttentionTile {
     }
 
     enum class Seen { none, some, all };
-    /// Some rows of the block meet a chunk: n keys of a segment from `key` on.
+    /// A pass: some rows of the block with one chunk, n keys of a segment starting at `key`.
     struct Pass {
       int segment = 0;
       std::int64_t key = 0;
       int n = 0;
       Seen seen = Seen::none;
-      bool sum = false;                    // what they see comes on top of earlier chunks
-      int first = 0, end = 0, buffer = 0;  // the rows, and whose scores and weights they are
+      bool sum = false;  // adds to earlier chunks' output
+      int first = 0, end = 0, buffer = 0;  // first row, number of rows, and the state with their scores
     };
     float* scores(const Pass& pass, int row) {
       return score + pass.buffer * kBufferSize + (row - pass.first) * kKeyStride;
@@ -107,7 +107,7 @@ class AttentionTile {
     void run() {
       start();
       Pass before, now = pass_from(0, 0);
-      if (now.n == 0) std::memset(mixed, 0, sizeof(mixed));  // the rows see nothing, and become NaNs
+      if (now.n == 0) std::memset(mixed, 0, sizeof(mixed));  // the rows see no key at all and become NaN
       multiply_keys(now);
       work.finish();
       while (now.n > 0) {
@@ -133,8 +133,7 @@ class AttentionTile {
       for (int r = 0; r < kRowVectors; r += kWidth) V::store(base + r, V::set(kNever));
     }
 
-    /// The first pass with the first chunk at or behind `key` of a segment of which the block's queries see something,
-    /// or none.
+    /// The first pass of the next chunk, at or after `key`, of which the block's queries see any key; or none.
     Pass pass_from(int i_segment, std::int64_t key) const {
       for (; i_segment < job.n_segment; ++i_segment, key = 0) {
         const AttentionJob::Segment& segment = job.segment[i_segment];
@@ -161,7 +160,7 @@ class AttentionTile {
       return next;
     }
 
-    /// Whether the block's queries see all of a chunk, some of it, or none.
+    /// Whether the block's queries see all, some or none of a chunk.
     Seen look(std::int64_t key, int n) const {
       bool none = true, all = true;
       for (int r = 0; r < n_row && (none || all); ++r) {
@@ -196,7 +195,7 @@ class AttentionTile {
                                                      depth, kPanel, scores(pass, r) + j, false);
     }
 
-    /// Scores become weights, and steps of the products that wait are done between the rows.
+    /// Turns scores into weights, with steps of queued products between the rows.
     void weigh(const Pass& pass) {
       if (pass.n % kPanel != 0 || pass.seen == Seen::some) hide(pass);
       const float factor = pass.seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE;
@@ -204,9 +203,9 @@ class AttentionTile {
       for (int r = pass.first; r < pass.end; r += kWidth) weigh_rows(r, pass, factor, n_step);
     }
 
-    /// Keys that there are not, and what the mask says.
+    /// Applies the mask, and hides padding keys.
     void hide(const Pass& pass) {
-      const int last = pass.n / kPanel * kPanel;  // of a panel that the keys do not fill
+      const int last = pass.n / kPanel * kPanel;  // padding of the last panel
       float missing[kPanel] = {};
       for (int j = pass.n - last; j < kPanel; ++j) missing[j] = kNever;
       for (int r = pass.first; r < pass.end; ++r) {
@@ -220,15 +219,15 @@ class AttentionTile {
       }
     }
 
-    /// Scores times `factor` become the logarithms of weights, for at most kWidth rows from `first` on: relative to the
-    /// greatest score so far, or to one that is nearly as great.
+    /// Scales scores by `factor` to logarithms of weights, for at most kWidth rows starting at `first`, relative to the
+    /// largest score so far or to one nearly as large.
     VLA_INLINE void weigh_rows(int first, const Pass& pass, float factor, int n_step) {
       const int end = pass.end - first < kWidth ? pass.end : first + kWidth;
       Float tops[kWidth] = {};
       for (int r = first; r < end; ++r) tops[r - first] = greatest(scores(pass, r), pass.n);
       const Float top = factor * across<V>(tops, [](Float a, Float b) VLA_LAMBDA { return V::max(a, b); });
       const Float before = V::load(base + first), now = top > before + P::kSlack ? top : before;
-      // A row that saw nothing yet has no greatest score; any finite one keeps its weights at zero.
+      // A row that saw no key yet has no largest score. Any finite base keeps its weights at zero.
       const Float offset = now == kNever ? Float{} : now;
       V::store(base + first, now);
       V::store(minus_offset + first, -offset);
@@ -261,7 +260,7 @@ class AttentionTile {
       V::store(sum + r * kWidth, even + odd);
     }
 
-    /// Makes what was mixed before relative to the greatest scores of now.
+    /// Rescales the output so far to the new largest scores.
     void shrink_rows(const Pass& pass) {
       for (int r = pass.first; pass.sum && r < pass.end; ++r) {
         if (shrink[r] == 1.0f) continue;
@@ -304,7 +303,7 @@ class AttentionTile {
       }
     }
 
-    /// The elements of one head of a row, from a column on.
+    /// Elements of one head in a row, starting at a column.
     void write_rounded(const float* from, float factor, std::int64_t row, std::int64_t column) const {
       alignas(64) Number room[kHeadStride];
       for (std::int64_t i = 0; i < job.d_head; i += 2 * kWidth)

@@ -5,14 +5,14 @@
 #include "kernels/math.h"
 #include "kernels/sizes.h"
 
-/// Attention of features to features (op::ChannelAttention). A group is small and its scores lie in the L1 cache, so
-/// that all of its work is a pass over the tokens for the scores, and one for what they mix.
+/// Attention between features (op::ChannelAttention). A group is small and its scores fit into the L1 cache, so it
+/// takes one pass over the tokens for the scores and one for the output.
 namespace vla::kernels {
 
-/// Features of a group that a kernel takes.
+/// The most features in a group.
 constexpr std::int64_t kMaxChannels = 64;
 
-/// q, k, v, y [d, n, n_view], tokens `q_stride` and so on apart, views `n` tokens apart.
+/// q, k, v, y [d, n, n_view]; `q_stride` and so on are strides of tokens, and views are `n` tokens apart.
 struct ChannelAttentionJob {
   const float *q, *k, *v;
   float* y;
@@ -28,9 +28,9 @@ using ChannelAttentionKernel = void (*)(const ChannelAttentionJob& job, std::int
 template <class V>
 VLA_INLINE void attend_channels(const ChannelAttentionJob& job, std::int64_t unit) {
   using Float = typename V::Float;
-  constexpr std::int64_t kBlock = 64;  // tokens whose products are added up before they are added to the rest
+  constexpr std::int64_t kBlock = 64;  // tokens whose products are summed before they are added to the total
   const std::int64_t d = job.d / job.n_group, first = unit % job.n_group * d, token = unit / job.n_group * job.n;
-  alignas(64) float score[kMaxChannels * kMaxChannels] = {};  // [key, query]: vectors of queries, as they are mixed
+  alignas(64) float score[kMaxChannels * kMaxChannels] = {};  // [key, query]: vectors of queries
   alignas(64) float block[kMaxChannels * kMaxChannels];
 
   for (std::int64_t t = 0; t < job.n; t += kBlock) {
@@ -49,7 +49,7 @@ VLA_INLINE void attend_channels(const ChannelAttentionJob& job, std::int64_t uni
   }
 
   const float scale = 1.0f / __builtin_sqrtf(static_cast<float>(job.n));
-  for (std::int64_t i = 0; i < d; i += V::width) {  // softmax over the keys, for a vector of queries
+  for (std::int64_t i = 0; i < d; i += V::width) {  // softmax over the keys for one vector of queries
     Float most = V::load(score + i), sum = {};
     for (std::int64_t j = 1; j < d; ++j) most = V::max(most, V::load(score + j * kMaxChannels + i));
     for (std::int64_t j = 0; j < d; ++j) {

@@ -7,16 +7,15 @@
 
 namespace vla::kernels {
 
-/// Numbers of the cores that this thread may run on.
+/// Indices of the cores that this thread may run on.
 std::vector<int> allowed_cores();
 
-/// Those of them with at least three quarters of the greatest capacity, as Linux gives it in cpuN/cpu_capacity of a
-/// folder: of big and little cores the big ones, all of one cluster whose chips differ a little. All where the system
-/// does not tell the capacity of each. A phase waits for its last item, which a little core takes two to four times as
-/// long for.
+/// The big cores: those with at least three quarters of the largest capacity in cpuN/cpu_capacity, which allows small
+/// differences between chips. All cores if the system does not give every capacity. A phase waits for its last item,
+/// which a little core takes two to four times as long for.
 std::vector<int> big_cores(const std::vector<int>& cores, const std::string& folder = "/sys/devices/system/cpu");
 
-/// Lets this thread run on these cores only, as far as the system permits it.
+/// Pins this thread to these cores, as far as the system permits.
 void stay_on(const std::vector<int>& cores);
 
 }  // namespace vla::kernels

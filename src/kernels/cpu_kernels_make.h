@@ -8,8 +8,8 @@
 
 namespace vla::kernels {
 
-/// The kernels of one instruction set, all from the same templates. Only a file that is compiled for V's instructions
-/// may include this. `Products`: of attention, a type of attention_products.h.
+/// The kernels of one instruction set, all from the same templates. Include this only in a file compiled for V's
+/// instructions. `Products`: those of attention, a type of attention_products.h.
 template <class Products>
 class CpuKernelsMaker {
   using V = typename Products::Vector;
@@ -87,8 +87,7 @@ class CpuKernelsMaker {
     for (std::int64_t i = 0; i < n; i += V::width) store<V>(y + i, load<V>(x + i, n - i) * s, n - i);
   }
 
-  /// The sum of (x - mean)^2, or of x where `mean` is null. Two chains of sums, so that one need not wait for the
-  /// other.
+  /// Sum of (x - mean)^2, or of x if `mean` is null. Two accumulators, so that additions do not wait for each other.
   static VLA_INLINE float sum(const float* x, const float* mean, std::int64_t n) {
     const auto add = [&](Float& sum, Float value) VLA_LAMBDA {
       sum = mean == nullptr ? sum + value : V::fma(value - *mean, value - *mean, sum);

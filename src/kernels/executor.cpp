@@ -13,9 +13,9 @@
 namespace vla::kernels {
 namespace {
 
-/// How long a worker without work spins before it sleeps. Longer than most operations of one thread, so that workers
-/// stay awake through a chain of them; short beside a time slice of the system, which takes a core that spins for one
-/// that works.
+/// How long a worker without work spins before it sleeps: longer than most operations on one thread, so that workers
+/// stay awake through a chain of them, and short beside a time slice, since the system takes a spinning core for a busy
+/// one.
 constexpr std::chrono::microseconds kSpin(20);
 
 constexpr std::uint64_t kCountBits = 24, kCountMask = (std::uint64_t{1} << kCountBits) - 1;
@@ -68,7 +68,7 @@ Executor::~Executor() {
 }
 
 Status Executor::reserve(std::size_t size) {
-  constexpr std::size_t kPage = 4096;  // no less than a line of a cache; pages of the system may be larger
+  constexpr std::size_t kPage = 4096;  // at least a cache line; pages may be larger
   const std::lock_guard lock(turn_);
   if (size <= scratch_size_) return {};
   size = (size + kPage - 1) / kPage * kPage;
@@ -124,7 +124,7 @@ bool Executor::has_work() const {
   });
 }
 
-/// Takes items as long as there are any, its own stretch first. False where there were none.
+/// Takes items while there are any, first from its own range. False if there were none.
 bool Executor::work(Worker& worker) {
   bool worked = false;
   for (int i = 0; i < n_stretch_; ++i) {
@@ -132,8 +132,8 @@ bool Executor::work(Worker& worker) {
     std::uint64_t left = stretch.left.load(std::memory_order_acquire);
     while ((left & kCountMask) != 0) {
       if (!stretch.left.compare_exchange_weak(left, left - 1, std::memory_order_acq_rel)) continue;
-      // From here to finish_item the phase cannot end.
-      // The scratch memory may have grown since the last run, but not while an item is held.
+      // Until finish_item the phase cannot end. Scratch memory may have grown since the last run, but not while an item
+      // is held.
       worker.begin(left >> kCountBits, scratch_.get() + static_cast<std::size_t>(worker.index) * scratch_size_);
       run_item(stretch.end - static_cast<std::int64_t>(left & kCountMask), worker);
       finish_item();
@@ -172,7 +172,7 @@ void Executor::open(std::size_t i_phase) {
     stretches_[i].left.store(ticket_ << kCountBits | static_cast<std::uint64_t>(end - begin),
                              std::memory_order_seq_cst);
   }
-  // A single item goes to the first thread, usually the one that opens the phase.
+  // A single item goes to the first thread, which usually opens the phase.
   if (n > 1) {
     wake(opened_, n_sleeping_, n > 2);
     wake(caller_word_, caller_sleeps_, false);

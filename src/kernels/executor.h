@@ -18,13 +18,13 @@
 
 namespace vla::kernels {
 
-/// A thread that takes items of a phase, with scratch memory of its own at a multiple of 4 KiB. An item must not rely
-/// on what lies there, unless items of its own job left it: the memory is the job's until another one takes it.
+/// A thread that takes items of a phase. It has scratch memory at a multiple of 4 KiB. An item may rely on the contents
+/// only if an item of the same job left them: the memory belongs to that job until another one takes it.
 class Worker {
  public:
   explicit Worker(int i) : index(i) {}
 
-  /// phase: the same number as long as one run of one phase lasts, and never again.
+  /// phase: a number that is unique to one run of one phase.
   void begin(std::uint64_t phase, std::byte* memory) { phase_ = phase, memory_ = memory; }
 
   /// Scratch memory for one item.
@@ -33,7 +33,7 @@ class Worker {
     owner_ = {};
     return reinterpret_cast<T*>(memory_);
   }
-  /// Scratch memory for items of one job that follow each other, and whether the last item left its own there.
+  /// Scratch memory for consecutive items of one job, and whether the last item left its contents there.
   template <class T>
   std::pair<T*, bool> scratch_of(const void* job) {
     const bool kept = owner_.job == job && owner_.phase == phase_;
@@ -41,7 +41,7 @@ class Worker {
     return {reinterpret_cast<T*>(memory_), kept};
   }
 
-  /// Scratch memory behind the first `offset` bytes. Whatever items left in the memory is given up.
+  /// Scratch memory after the first `offset` bytes. Earlier contents are lost.
   std::byte* scratch_from(std::size_t offset) {
     owner_ = {};
     return memory_ + offset;
@@ -58,13 +58,13 @@ class Worker {
   } owner_;
 };
 
-/// Work that is cut into items, which any worker may take in any order.
+/// Work that is split into items, which any worker may take in any order.
 class Task {
  public:
   virtual ~Task() = default;
   virtual void run(std::int64_t item, Worker& worker) const = 0;
 
-  /// Runs an item, whose time counts for the task's kind while the clock runs.
+  /// Runs an item. Its time counts for the task's kind while the clock runs.
   void take(std::int64_t item, Worker& worker) const {
     if (clock == nullptr || !clock->runs.load(std::memory_order_relaxed)) return run(item, worker);
     const auto start = std::chrono::steady_clock::now();
@@ -74,7 +74,7 @@ class Task {
 
   std::int64_t n_item = 1;
   KindClock::Kind kind = KindClock::others;
-  KindClock* clock = nullptr;  // which outlives the task
+  KindClock* clock = nullptr;  // must outlive the task
 };
 
 /// A task whose items are calls of run(item, worker).
@@ -93,28 +93,29 @@ std::unique_ptr<Task> task_of(std::int64_t n_item, Run run) {
 /// Tasks that do not depend on each other: their items are taken side by side.
 struct Phase {
   std::vector<const Task*> tasks;
-  std::chrono::steady_clock::time_point* done = nullptr;  // when the last item was done in the last run, if wanted
+  std::chrono::steady_clock::time_point* done = nullptr;  // when the last run finished the last item, if asked
 };
 
-/// Threads that run phases one after the other. A phase is done when its *items* are done: a worker that the system has
-/// put aside between two items delays no other. Who finishes the last item opens the next phase. A worker without work
-/// spins for a moment, then sleeps until a phase of several items is opened: an idle executor takes no time.
+/// A thread pool that runs phases in order. A phase is done when its *items* are done, so a worker that the system
+/// suspends between two items delays nobody. The worker that finishes the last item opens the next phase. A worker
+/// without work spins briefly, then sleeps until a phase of several items opens; an idle executor uses no processor
+/// time.
 ///
-/// A worker starts with a stretch of the items that is its own from run to run, whose operands may still lie in its
-/// caches, and then helps with those of others.
+/// Each worker has its own range of items, the same in every run so that operands may still be in its caches, and then
+/// helps with the others' items.
 class Executor {
  public:
-  /// The executor of `n_thread` threads, the caller of `run` among them. Engines of one process that ask for the same
-  /// number share it, and their runs take turns. Errors: device where the system refuses a thread.
+  /// The executor of `n_thread` threads, including the caller of `run`. Engines of one process with the same number
+  /// share it, and their runs take turns. Errors: device if the system refuses a thread.
   static Result<std::shared_ptr<Executor>> shared(int n_thread);
   explicit Executor(int n_thread);
   ~Executor();
 
   int n_thread() const { return n_thread_; }
-  /// At least `size` bytes of scratch memory for each worker from the next run on. Errors: out_of_memory.
+  /// Ensures at least `size` bytes of scratch memory per worker from the next run on. Errors: out_of_memory.
   Status reserve(std::size_t size);
   std::size_t scratch_size() const { return scratch_size_ * static_cast<std::size_t>(n_thread_); }
-  /// Has the system back the scratch memory now.
+  /// Faults the scratch memory in now.
   void touch();
 
   /// Runs the phases in order and returns when the last is done. One thread at a time runs; others wait.
@@ -122,11 +123,11 @@ class Executor {
 
  private:
   static constexpr int kMaxStretches = 64;
-  /// How many items of a worker's stretch are left, below the number of the phase that they belong to: a worker that
-  /// was put aside cannot take an item of a later phase for one of an earlier.
+  /// Items left in a worker's range, with the phase number in the upper bits: a suspended worker cannot take an item of
+  /// a later phase for one of an earlier phase.
   struct alignas(64) Stretch {
     std::atomic<std::uint64_t> left = 0;
-    std::int64_t end = 0;  // one behind the last item
+    std::int64_t end = 0;  // end of the range
   };
 
   Status start();
@@ -141,22 +142,22 @@ class Executor {
   void wake(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleeping, bool all);
 
   const int n_thread_, n_stretch_;
-  std::mutex turn_;  // of those who run
+  std::mutex turn_;  // held by the caller of `run`
   std::vector<std::thread> threads_;
-  std::atomic<std::size_t> scratch_size_ = 0;  // told while others load
+  std::atomic<std::size_t> scratch_size_ = 0;  // grown while others load
   struct Free {
     void operator()(std::byte* memory) const;
   };
   std::unique_ptr<std::byte, Free> scratch_;
 
-  // What runs. Written by the thread that opens a phase, read by workers that hold an item of it.
+  // The current phase. Written by the thread that opens it, read by workers that hold one of its items.
   std::span<const Phase> phases_;
   std::size_t i_phase_ = 0;
   std::uint64_t ticket_ = 0;
   Stretch stretches_[kMaxStretches];
-  alignas(64) std::atomic<std::int64_t> n_left_ = 0;  // items of the phase that are not done
+  alignas(64) std::atomic<std::int64_t> n_left_ = 0;  // unfinished items of the phase
 
-  // Two words to sleep on: workers for a phase, the caller for a phase or the end.
+  // Two words to sleep on: workers wait for a phase, the caller for a phase or the end.
   alignas(64) std::atomic<std::uint32_t> opened_ = 0;
   std::atomic<int> n_sleeping_ = 0;
   alignas(64) std::atomic<std::uint32_t> caller_word_ = 0;

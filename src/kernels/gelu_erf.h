@@ -4,18 +4,18 @@
 
 #include "kernels/math.h"
 
-/// GELU as it is defined: x Phi(x), Phi being the distribution function of a normal variable. With y = |x| it is
+/// GELU by its definition: x Phi(x), where Phi is the normal distribution function. With y = |x| it is
 ///     max(x, 0) - g(y) e^(-y^2/2),    g(y) = y erfcx(y / sqrt(2)) / 2,
-/// where g only rises from 0 to 1 / sqrt(2 pi): the negative tail keeps its relative accuracy as long as the result is
-/// a normal number, where 1 + erf would have lost it from -3 on.
+/// where g rises from 0 to 1 / sqrt(2 pi). The negative tail keeps its relative accuracy as long as the result is a
+/// normal number; 1 + erf would lose it below -3.
 namespace vla::kernels {
 
 namespace normal_tail {
 
-/// g, piece by piece, minimax: relative error 2^-25.7. Pieces of y end at 0.5, 1, 2, 3, 5, 7, 11 and 15, where the
-/// exponent and the first bit of 1 + y change: those are the index, so that the row of [0, 0.5] is the seventh. In a
-/// piece g is start + slope y + sum of c[i] (y - center)^(i + 1). Near the middle of a piece there is a number whose g
-/// is a float32 to 2^-34: that is its center, and `start` rounds nothing. Near zero g is y / 2 and terms of y^2.
+/// Piecewise minimax approximation of g: relative error 2^-25.7. Pieces of y end at 0.5, 1, 2, 3, 5, 7, 11 and 15,
+/// where the exponent and first bit of 1 + y change; these bits are the index, so [0, 0.5] is row seven. In a piece g =
+/// start + slope y + sum of c[i] (y - center)^(i + 1). `center` is a point near the middle whose g is a float32 to
+/// 2^-34, so `start` rounds nothing. Near zero g is y / 2 plus terms of y^2.
 struct Pieces {
   float center[8], slope[8], start[8], c[7][8];
 };
@@ -41,19 +41,20 @@ inline constexpr Pieces kPieces = {
 
 }  // namespace normal_tail
 
-/// x Phi(x), within two units in the last place over the whole range, subnormal results included. Minus infinity gives
+/// x Phi(x), within two units in the last place over the whole range, also for subnormal results. Minus infinity gives
 /// NaN. Source: torch gelu(approximate="none").
 template <class V>
 VLA_INLINE typename V::Float gelu_erf(typename V::Float x) {
   using Float = typename V::Float;
   using Int = typename V::Int;
   using normal_tail::kPieces;
-  // Products with e^(-y^2/2) are kept times 2^64, so that nothing leaves the normal floats before the last step.
+  // Keeps products with e^(-y^2/2) scaled by 2^64, so that only the last step can leave the normal floats.
   constexpr float kUnit = 0x1p-64f, kShift = 0x1.8p23f + 127 + 64;
   constexpr float kCoarse = 0x1.8p18f;  // adding it rounds to a multiple of 2^-5
   const Float size = size_of<V>(x), y = V::min(V::set(14.5f), size);
 
-  // y^2 log2(e) / 2 = n - rest. y^2 and the factor are in two parts each, and the product of the first ones is exact.
+  // y^2 log2(e) / 2 = n - rest. y^2 and the factor are split in two parts, so that the product of their first parts is
+  // exact.
   const Float square = V::fma(y, y, V::set(kCoarse)) - kCoarse, low_square = V::fma(y, y, -square);
   const Float a = V::set(-0x1.714p-1f), low_a = V::set(-0x1.47652cp-13f);
   const Float shifted = V::fma(square, a, V::set(kShift));
@@ -68,13 +69,13 @@ VLA_INLINE typename V::Float gelu_erf(typename V::Float x) {
   for (int i = 5; i >= 0; --i) q = V::fma(q, beside, V::look_up(kPieces.c[i], piece));
   const Float base = V::fma(V::look_up(kPieces.slope, piece), y, V::look_up(kPieces.start, piece));
 
-  // What g and 2^rest have beside `base` and 1 is small, and so are the roundings of it.
+  // The parts of g and 2^rest beyond `base` and 1 are small, and so are their rounding errors.
   const Float r = q * beside, more = V::fma(rest * sigmoid::slope_of_power<V>(rest), base + r, r);
   const Float tail = V::fma(power, more, power * base);
   return V::fma(tail, V::set(-kUnit), V::fma(V::set(0.5f), size, 0.5f * x));
 }
 
-/// The same for results that are then rounded to bf16: relative error 2^-13.
+/// The same for results that are rounded to bf16 afterwards: relative error 2^-13.
 template <class V>
 VLA_INLINE typename V::Float gelu_erf_for_bf16(typename V::Float x) {
   using Float = typename V::Float;

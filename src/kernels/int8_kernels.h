@@ -6,9 +6,8 @@
 
 namespace vla::kernels {
 
-/// The implementations of products of ternary matrices, of int4 ones and of int8 ones, best first; the last runs on
-/// every machine. All of a list read the same packed weights and the same codes, and give the same bits up to the
-/// activation.
+/// Kernels for products of ternary, int4 and int8 matrices, best first; the last one runs on every machine. All of a
+/// list read the same packed weights and codes and give the same bits, up to the activation.
 std::span<const LinearKernel* const> ternary_kernels();
 std::span<const LinearKernel* const> int4_kernels();
 std::span<const LinearKernel* const> int8_kernels();

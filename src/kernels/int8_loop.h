@@ -6,15 +6,15 @@
 #include "kernels/linear_stripe.h"
 #include "kernels/tile_heights.h"
 
-/// The loop around a tile of products of int8 codes of x and weights that are ternary, int4 or int8: what an item is,
-/// what lies in which cache.
+/// The loop around a tile of integer products of x's int8 codes and ternary, int4 or int8 weights: how work is split
+/// into items, and what stays in which cache.
 ///
-/// A panel's columns are taken a step of the depth at a time, which stays in a cache while all rows of a block of x
-/// pass by. Two or four bits an element are expanded to bytes once for them; of few rows the tile unpacks them. Sums
-/// are integers, so that they are the same in every order.
+/// A panel is taken a step of the depth at a time. The step stays in a cache while all rows of a block of x pass by.
+/// Weights of two or four bits are expanded to bytes once per step; for few rows the tile unpacks them itself. Sums are
+/// integers, so their order does not matter.
 namespace vla::kernels {
 
-/// The values of a row's sums, of weights with an offset: float(sum) * (scale of W, or of its column / s of the
+/// Turns a row's sums into values; the weights have an offset: float(sum) * (scale of W, or of its column / s of the
 /// row).
 template <class V, class Weights, int kColumns, int kOffset>
 VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const RowScale& row, const std::int32_t* from,
@@ -89,7 +89,7 @@ class Int8Loop {
   static constexpr std::int32_t kOffset = Tile::kSigned ? 0 : Weights::kOffset;
 
   struct Scratch {
-    // In pairs: which rows of x the block holds. Items of one block follow each other, so that a worker copies it once.
+    // In pairs: the rows of x in the block. Items of one block are consecutive, so a worker copies it once.
     std::int64_t row;
     alignas(64) std::byte x[kPairs ? (Tile::kBlockKiB << 10) + (kRows + 1) * quantized_stride(kMaxPairedDepth) : 1];
     alignas(64) std::byte panel[kPacked || kPairs ? Tile::kStep * kColumns : 1];
@@ -99,7 +99,7 @@ class Int8Loop {
   };
 
  public:
-  /// The row of the table that this tile makes. Whoever quantizes x computes its norm, of any width.
+  /// The kernel table's row for this tile. The quantizer of x computes its norm, of any width.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use)) {
     return {
         .name = name,
@@ -123,7 +123,7 @@ class Int8Loop {
         n_block_(ceil_div(job.n_row, block_rows_)),
         n_panel_(Stripes::n_panel(job)) {}
 
-  /// Rows that stay in a cache while panels pass by.
+  /// Rows of x that stay in a cache while panels pass by.
   static std::int64_t block_rows(std::int64_t x_stride) {
     return min(kBlockRows, round_up((Tile::kBlockKiB << 10) / x_stride + 1, kRows));
   }
@@ -134,7 +134,7 @@ class Int8Loop {
     return loop.n_block_ * job.n_group;
   }
 
-  /// Some panels by a block of rows.
+  /// An item: some panels by a block of rows.
   static void run(const LinearJob& job, std::int64_t item, Worker& worker) {
     [[maybe_unused]] const typename Tile::Session session;
     Int8Loop loop(job);
@@ -164,7 +164,7 @@ class Int8Loop {
                  scratch_->x + r * job_.x_stride);
   }
 
-  /// A tile's sums are complete, and some of its rows are finished: they become the gates, or y.
+  /// Finishes some rows of a tile whose sums are complete: writes gates or y.
   struct Summed {
     const Int8Loop* loop = nullptr;
     const LinearJob::Part* part = nullptr;
@@ -184,7 +184,7 @@ class Int8Loop {
     void finish() { finish(n_row); }
   };
 
-  /// Sums of a panel's columns.
+  /// Sums of the products in a panel's columns.
   VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, bool gate) {
     const std::int64_t n_tile = ceil_div(s.n_row, kRows), depth = quantized_depth(job_.d_in);
     const std::int64_t step = even_block(depth, Tile::kStep, kQuantizedUnit);
@@ -240,7 +240,7 @@ class Int8Loop {
 
   const LinearJob& job_;
   Scratch* scratch_ = nullptr;
-  Summed summed_;  // the tile before
+  Summed summed_;  // the previous tile
   const std::int64_t block_rows_, n_block_, n_panel_;
 };
 

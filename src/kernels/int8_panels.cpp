@@ -13,7 +13,7 @@ std::size_t size_of(const MatrixDesc& desc) {
                                   Panels::strip_size(desc.d_in));
 }
 
-/// Four bytes of four codes each, as four by four codes of two bits: rows become columns.
+/// Transposes four bytes of four 2-bit codes each.
 std::uint32_t transposed(std::uint32_t codes) {
   std::uint32_t moved = (codes ^ codes >> 6) & 0x00CC00CC;
   codes ^= moved ^ moved << 6;
@@ -58,7 +58,7 @@ void Int4Panels::pack(const MatrixDesc& desc, const std::byte* stored, std::byte
     for (std::int64_t k = 0; k < desc.d_in; k += Int4Block::kElements, ++block, step += kColumns) {
       *step = std::byte{block->step};
       for (std::int64_t i = 0; i < Int4Block::kElements; i += 8, lines += kLine) {
-        // Bytes of two neighbours each become bytes of two that are four apart.
+        // Regroups codes: a byte of two neighbours becomes a byte of two codes that are four apart.
         std::uint32_t two;
         std::memcpy(&two, block->codes.data() + i / 2, sizeof(two));
         const std::uint32_t low = two & 0x0f0f0f0f, high = two >> 4 & 0x0f0f0f0f;

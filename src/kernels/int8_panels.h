@@ -8,12 +8,12 @@
 #include "kernels/linear_kernel.h"
 #include "kernels/quantized.h"
 
-/// How a ternary matrix, or one of int4 or int8, lies in memory for the kernels, from load on.
+/// How kernels store a ternary, int4 or int8 matrix, from load on.
 ///
-/// A *strip* holds 16 columns of the product (rows of W) over the whole depth (d_in). Kernels multiply a line of 64
-/// bytes at a time, four consecutive elements of every column, as instructions that sum products of four bytes take
-/// them. Elements may be stored with an offset, which comes off the sums again. Zeros fill strips up to four, and the
-/// depth up to 64, where x has zeros.
+/// A *strip* holds 16 columns of the product (rows of W) over the whole depth (d_in). Kernels multiply one line of 64
+/// bytes at a time: four consecutive elements of every column, as instructions that sum four byte products take them.
+/// Elements may be stored with an offset, which is subtracted from the sums. Strips are padded with zeros to a multiple
+/// of four and the depth to 64, where x has zeros too.
 namespace vla::kernels {
 
 template <class Element, std::size_t kBytes>
@@ -25,8 +25,7 @@ struct Int8Panels {
   static constexpr std::int64_t kColumns = 16, kGroup = 16, kLine = 64;
 };
 
-/// Lines as they are multiplied: -128 to 127, and 128 more where instructions take weights without a sign, as those of
-/// x86-64 do.
+/// Lines as instructions multiply them: -128 to 127, plus 128 where instructions take unsigned weights, as on x86-64.
 struct BytePanels : Int8Panels {
 #if defined(__x86_64__)
   using Number = std::uint8_t;
@@ -43,20 +42,20 @@ struct BytePanels : Int8Panels {
   template <int kStrips>
   struct Strips;
 
-  // A LinearKernel's functions.
+  // Functions of a LinearKernel.
   static std::size_t packed_size(const MatrixDesc& desc);
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
 };
 
-/// The elements of a panel of kStrips as a tile reads them, with their offset: load(k, s, i, byte) is a vector from a
-/// byte on of the line that holds elements k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16, and all of one block
-/// of 64. Here they lie as they are multiplied.
+/// How a tile reads the elements of a panel of kStrips, with their offset. load(k, s, i, byte) returns a vector,
+/// starting at a byte, of the line with elements k + 4 s to k + 4 s + 3 of strip i. k is a multiple of 16 and all
+/// elements are in one block of 64. Here lines are stored as they are multiplied.
 template <int kStrips>
 struct BytePanels::Strips {
   const std::byte* strips;
-  std::int64_t strip;  // bytes from one to the next
+  std::int64_t strip;  // stride in bytes
 
-  /// From element k of a depth on.
+  /// Starts at element k of the depth.
   Strips(const std::byte* all, std::int64_t d_in, std::int64_t k)
       : strips(all + strip_size(k)), strip(strip_size(d_in)) {}
 
@@ -69,9 +68,8 @@ struct BytePanels::Strips {
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
-/// Two bits for an element, -1 to 1 plus 1: byte 4 n + i of a line has elements i, 4 + i, 8 + i and 12 + i of column n,
-/// the first in its lowest bits. So what is left of the line after a shift by 2 s and a mask is one as it is
-/// multiplied.
+/// Two bits per element, value + 1: byte 4 n + i of a line has elements i, 4 + i, 8 + i and 12 + i of column n, the
+/// first in its lowest bits. A shift by 2 s and a mask therefore gives a line as it is multiplied.
 struct TernaryPanels : Int8Panels {
   static constexpr int kOffset = 1;
   static constexpr bool kManyScales = false;
@@ -80,7 +78,7 @@ struct TernaryPanels : Int8Panels {
     return quantized_depth(d_in) / kGroup * kLine;
   }
 
-  // A LinearKernel's functions.
+  // Functions of a LinearKernel.
   static std::size_t packed_size(const MatrixDesc& desc);
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
 
@@ -106,9 +104,9 @@ struct TernaryPanels::Strips {
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
-/// Codes of four bits and a step for each 64 of a column (Int4Block), which give the elements of BytePanels: byte 4 n +
-/// i of a line has codes i and 4 + i of column n. Behind the lines of a strip are its steps, 16 for each 64 of the
-/// depth.
+/// Codes of four bits and a step for each 64 elements of a column (Int4Block), decoded to the elements of BytePanels.
+/// Byte 4 n + i of a line has codes i and 4 + i of column n. After the lines of a strip come its steps, 16 for each 64
+/// of the depth.
 struct Int4Panels : Int8Panels {
   static constexpr int kOffset = BytePanels::kOffset;
   static constexpr bool kManyScales = true;
@@ -120,7 +118,7 @@ struct Int4Panels : Int8Panels {
     return lines_size(d_in) + quantized_depth(d_in) / Int4Block::kElements * kColumns;
   }
 
-  // A LinearKernel's functions.
+  // Functions of a LinearKernel.
   static std::size_t packed_size(const MatrixDesc& desc);
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
 
@@ -128,7 +126,7 @@ struct Int4Panels : Int8Panels {
   struct Strips;
 };
 
-/// The same for a tile that multiplies codes, and sums of a block by its step: load gives codes, 1 to 15.
+/// The same for a tile that multiplies codes and scales sums of a block by its step: load returns codes, 1 to 15.
 struct Int4Codes : Int4Panels {
   template <int kStrips>
   struct Strips;
@@ -151,7 +149,7 @@ struct Int4Codes::Strips {
     std::memcpy(&codes, lines + i * strip + k * 8 + s / 2 * kLine + byte, sizeof(codes));
     return std::bit_cast<Vector>((codes >> s % 2 * 4) & 0x0f0f);
   }
-  /// The step of each column, twice, in 16 bits.
+  /// The step of each column, twice, as 16 bits.
   template <class Vector>
   VLA_INLINE Vector step(std::int64_t k, int i, int byte) const {
     using Columns = typename VectorOf<std::uint8_t, sizeof(Vector) / 4>::Type;
@@ -159,7 +157,7 @@ struct Int4Codes::Strips {
     using Fours = typename VectorOf<std::uint32_t, sizeof(Vector)>::Type;
     Columns columns;
     std::memcpy(&columns, steps + i * strip + k / Int4Block::kElements * kColumns + byte / 4, sizeof(columns));
-    // In two steps: GCC 12 widens bytes to four of them one by one.
+    // In two steps, because GCC 12 would widen bytes to 32 bits one by one.
     const Fours step = __builtin_convertvector(__builtin_convertvector(columns, Twos), Fours);
     return std::bit_cast<Vector>(step | step << 16);
   }
@@ -175,8 +173,8 @@ struct Int4Panels::Strips : Int4Codes::Strips<kStrips> {
   VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
     using Pairs = typename VectorOf<std::uint16_t, sizeof(Vector)>::Type;
     const auto step = Packed::template step<Pairs>(k, i, byte);
-    // Two bytes at once, with an offset that keeps each from 0 to 255 and so from its neighbour: of code * step, and of
-    // the difference.
+    // Multiplies two bytes at once. An offset keeps each product and difference in 0 to 255, so that it does not carry
+    // into its neighbour.
     const auto codes = Packed::template load<Pairs>(k, s, i, byte);
     const auto numbers = codes * step + (kHalf * kBoth - step * (Int4Block::kZero * kBoth));
     return std::bit_cast<Vector>(numbers ^ (kHalf - kOffset) * kBoth);
@@ -187,9 +185,9 @@ struct Int4Panels::Strips : Int4Codes::Strips<kStrips> {
 };
 static_assert(15 * Int4Block::kMaxStep <= 255 && Int4Block::kMost * Int4Block::kMaxStep < 128);
 
-/// Elements of a panel that were expanded to bytes: lines of 64 with four elements of 16 columns, of one strip after
-/// the other, then the next four elements. fetch(k, s, i) asks for the line that is loaded kAhead groups of four
-/// elements later: a long step lies in the L2 cache.
+/// Elements of a panel expanded to bytes: lines of 64 with four elements of 16 columns, for each strip, then the next
+/// four elements. fetch(k, s, i) prefetches the line that is loaded kAhead groups later; a long step lies in the L2
+/// cache.
 template <int kStrips, class Packed>
 struct ExpandedStrips {
   static constexpr std::int64_t kAhead = 8;
@@ -212,7 +210,7 @@ struct ExpandedStrips {
   }
 };
 
-/// The same where they are read for the first time: what is loaded is written to the lines.
+/// The same for the first read: writes each loaded vector to the lines.
 template <int kStrips, class Packed>
 struct ExpandingStrips {
   std::byte* lines;
@@ -227,8 +225,8 @@ struct ExpandingStrips {
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
-/// Writes the lines that ExpandedStrips reads, of `depth` elements from k on, kUnit at a time; Vector as wide as the
-/// machine's.
+/// Writes the lines that ExpandedStrips reads for `depth` elements starting at k, kUnit at a time; Vector is as wide as
+/// the machine's.
 template <class Vector, int kStrips, int kUnit = kQuantizedUnit, class Strips>
 VLA_INLINE void expand(const Strips& strips, std::int64_t k, std::int64_t depth, std::byte* to) {
   for (const std::int64_t end = k + depth; k < end; k += kUnit)

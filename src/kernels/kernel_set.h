@@ -9,8 +9,7 @@
 
 namespace vla {
 
-/// Kernels under a name that `--kernels` takes: the features without which they do not run, and all that they use where
-/// they are there.
+/// A set of kernels by its `--kernels` name: the features that it needs, and all features that it uses if present.
 struct KernelSet {
   const char* name;
   Features needs, uses;
@@ -20,7 +19,7 @@ struct KernelSet {
 
 namespace kernel_set {
 
-inline constexpr KernelSet ggml = {"ggml", {}, {}};  // none of our own: the reference of every other
+inline constexpr KernelSet ggml = {"ggml", {}, {}};  // no kernels of our own: the reference for all others
 inline constexpr KernelSet portable = {"portable", {Feature::baseline}, {Feature::baseline}};
 inline constexpr KernelSet neon = {"neon", {Feature::neon}, {Feature::neon, Feature::dotprod, Feature::i8mm}};
 inline constexpr KernelSet neon_bf16 = {
@@ -41,21 +40,21 @@ inline constexpr KernelSet all[] = {ggml, portable, neon, neon_bf16, avx2, avx51
 
 }  // namespace kernel_set
 
-/// Those that a processor can run, `ggml` first and the best last.
+/// The sets that a processor can run, `ggml` first and the best last.
 std::vector<KernelSet> kernel_sets(Features machine);
 /// Those of this one.
 const std::vector<KernelSet>& usable_kernels();
 
-/// The best whose needs are among these features.
+/// The best set that needs only these features.
 const KernelSet& kernel_set_of(Features use);
 inline std::string name_of(const KernelSet& set) { return set.name; }
 inline std::string name_of(Features use) { return kernel_set_of(use).name; }
 
-/// Whether kernels round what they multiply to bf16 where they may use these features.
+/// Whether kernels that use these features round operands to bf16.
 constexpr bool rounds_to_bf16(Features use) { return use.has(Feature::avx512_bf16) || use.has(Feature::neon_bf16); }
 constexpr bool rounds_to_bf16(const KernelSet& set) { return rounds_to_bf16(set.uses); }
 
-/// The features that are left where nothing may be rounded to bf16.
+/// These features without those that round to bf16.
 constexpr Features without_rounding(Features use) {
   return use.without({Feature::avx512_bf16, Feature::amx_bf16, Feature::amx_int8, Feature::neon_bf16});
 }

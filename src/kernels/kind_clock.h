@@ -9,7 +9,7 @@
 
 namespace vla::kernels {
 
-/// The time of operations by kind, while somebody wants to know: two readings of the clock for each item.
+/// Counts the time of operations by kind while it is on: two clock readings per item.
 struct KindClock {
   enum Kind { products, attention, norms, others, count };
   static constexpr const char* kNames[] = {"products", "attention", "norms and codes", "others"};
@@ -19,7 +19,7 @@ struct KindClock {
   }
 
   std::atomic<bool> runs = false;
-  std::array<std::atomic<std::int64_t>, count> nanoseconds = {};  // of all threads together
+  std::array<std::atomic<std::int64_t>, count> nanoseconds = {};  // summed over threads
 };
 
 }  // namespace vla::kernels

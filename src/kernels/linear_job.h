@@ -12,12 +12,12 @@
 
 namespace vla::kernels {
 
-/// Matrix products of one x, with their epilogues: operands and addresses.
+/// Matrix products of one x with their epilogues: operands and addresses.
 struct LinearJob {
   /// y = activation(W x + bias) * factor + residual, or the ReLU of that. y and residual are contiguous rows of d_out
-  /// elements, one for each row of x; bias, factor [d_out] and residual may be null.
+  /// elements, one per row of x. bias [d_out], factor [d_out] and residual may be null.
   struct Part {
-    DType type;               // of the stored weight
+    DType type;  // dtype of the stored weight
     const std::byte* weight;  // packed for its kernel
     const float* bias;
     const float* factor;

@@ -7,19 +7,21 @@
 
 namespace vla::kernels {
 
-/// Float32: 6 rows times four vectors, by lanes: four elements of a row are one load.
+/// Float32 products of 6 rows by four vectors. One load brings four elements of a row, which multiply-adds take by
+/// lane.
 struct NeonProducts : FloatProducts<Neon, 6, 4> {
   static constexpr int kMinPanel = kPanel, kDepth = 4;
 
-  /// kPanel rows become as many steps of the depth, from `k` on.
+  /// Transposes kPanel rows into steps of the depth, starting at `k`.
   static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t, Number* panel) {
     for (int i = 0; i < kPanel; ++i)
       std::memcpy(panel + (k + i) * kPanel, rows + i * kHeadStride, kPanel * sizeof(*rows));
   }
 
-  /// Products, each done at once.
+  /// Products that are computed immediately.
   struct Work {
-    /// c = a * panel, or c += where `sum`. a [depth, kTile] and c [width, kTile], rows `kStrideA` and `kStrideC` apart.
+    /// c = a * panel, or c += a * panel if `sum`. a [depth, kTile] and c [width, kTile], with row strides `kStrideA`
+    /// and `kStrideC`.
     template <int kStrideA, int kStrideC>
     VLA_INLINE void add(const float* a, const float* panel, std::int64_t depth, std::int64_t, float* c, bool sum) {
       Float sums[kVectors][kTile];

@@ -20,7 +20,7 @@ struct Int8Pairs {
   }
 };
 
-/// SMMLA: 6 rows by 16 columns, 24 sums of two rows by two columns.
+/// SMMLA: 6 rows by 16 columns, as 24 sums of two rows by two columns.
 struct MatrixTile {
   using V = Neon;
   static constexpr int kRows = kMmlaRows, kColumns = kMmlaColumns, kBlockRows = 216, kStep = 2048;
@@ -29,7 +29,7 @@ struct MatrixTile {
   static constexpr RoundedLayout kLayout = RoundedLayout::none;
   struct Session {};
 
-  /// Two rows of codes become a pair of rows.
+  /// Interleaves two rows of codes.
   static VLA_INLINE void pair(const std::byte* first, const std::byte* second, std::int64_t depth, std::byte* to) {
     for (std::int64_t k = 0; k < depth; k += 16, to += 32) {
       int64x2_t a, b;
@@ -39,7 +39,7 @@ struct MatrixTile {
     }
   }
 
-  /// Lines of four elements of each column become pairs of columns of eight.
+  /// Rearranges lines of four elements per column into pairs of columns with eight elements.
   template <class Strips>
   static VLA_INLINE void expand(const Strips& strips, std::int64_t depth, std::byte* to) {
     for (std::int64_t k = 0; k < depth; k += Int8Panels::kGroup, to += 256)
@@ -65,7 +65,7 @@ bool supports(const MatrixDesc& desc, Features use) {
   return !is_float(desc.type) && use.has(Feature::i8mm) && use.has(Feature::dotprod) && desc.d_in <= kMaxPairedDepth;
 }
 
-/// Few rows do not repay the two arrangements of pairs: SDOT takes them as they are.
+/// For few rows, rearranging pairs costs more than it gains; SDOT reads codes as they are.
 template <class Panels>
 constexpr LinearKernel kernel(const LinearKernel& small_batch) {
   LinearKernel row = Int8Loop<MatrixTile, Panels>::kernel("i8mm_int8", supports);

@@ -7,14 +7,15 @@
 namespace vla::kernels {
 namespace {
 
-/// 6 rows by 4 vectors: 24 of the 32 registers are sums. Four elements of a row of x are one load, and a multiply-add
-/// takes one of them by its lane.
+/// 6 rows by 4 vectors: 24 of the 32 registers hold sums. One load brings four elements of a row of x, which
+/// multiply-adds take by lane.
 struct NeonTile {
   using V = Neon;
   using X = float;
   static constexpr int kRows = 6, kColumns = 16, kVectors = kColumns / V::width;
   static constexpr int kMaxDepth = 2048, kStep = 512, kBlockRows = 54;
-  static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
+  // not a multiple of a page, so that rows do not compete for the same cache lines
+  static constexpr int kXStride = kMaxDepth + 16;
   static constexpr bool kEven = true, kRounds = false;
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
@@ -34,8 +35,8 @@ struct NeonTile {
  private:
   using Float = V::Float;
 
-  // Bytes of a panel that four steps of the depth are, where columns 4 n to 4 n + 3 of step k of them lie, what adds
-  // them to the sums of six rows, and these columns as floats.
+  // How a panel stores elements: bytes for four steps of the depth, the place of columns 4 n to 4 n + 3 of step k, the
+  // instructions that add them to the sums of six rows, and the columns as floats.
   struct Floats {
     static constexpr int kSize = 256;
     static constexpr int place(int k, int n) { return 64 * k + 16 * n; }
@@ -85,7 +86,7 @@ struct NeonTile {
 #pragma GCC unroll 6
       for (Float& sum : column) sum = zero;
     for (const float* end = x + depth; x < end; x += 4, line += Line::kSize, ahead += 16) {
-      __builtin_prefetch(ahead, 0, 2);  // to the L2 cache
+      __builtin_prefetch(ahead, 0, 2);  // prefetch to L2
       Float rows[kCount];
 #pragma GCC unroll 6
       for (int r = 0; r < kCount; ++r) rows[r] = V::load(x + r * kXStride);

@@ -8,10 +8,10 @@
 namespace vla::kernels {
 namespace {
 
-/// BFMMLA adds the products of four bf16 to a sum in two steps of two. In each it rounds the sum of the two products,
-/// and then their sum with what is there, to odd: to whichever neighbour has an odd last bit, which errs by less than
-/// a unit in the last place, where IEEE's rounding errs by half of one. Values below 2^-126 become zeros.
-/// Source: Arm Architecture Reference Manual, BFMatMulAddH and BFRound, where FPCR.EBF is 0, as Linux leaves it.
+/// BFMMLA adds four products of bf16 to a sum, two at a time. Each time it rounds the sum of the two products, and then
+/// that plus the accumulator, to odd: to the neighbour with an odd last bit, an error below one unit in the last place
+/// instead of IEEE's half. Values below 2^-126 are flushed to zero. Source: Arm Architecture Reference Manual,
+/// BFMatMulAddH and BFRound with FPCR.EBF = 0, which is Linux's setting.
 struct Bf16Pairs {
   using Sum = float;
   using Vector = float32x4_t;
@@ -25,14 +25,14 @@ struct Bf16Pairs {
   }
 };
 
-/// 6 rows by 16 columns: 24 sums of two rows by two columns.
+/// 6 rows by 16 columns, as 24 sums of two rows by two columns.
 struct NeonBf16Tile {
   using V = Neon;
   using X = std::uint16_t;
   static constexpr int kRows = kMmlaRows, kColumns = kMmlaColumns;
   static constexpr int kMaxDepth = 2048, kStep = 1024, kBlockRows = 108;
   static constexpr int kXStride = kMaxDepth + 16;
-  static constexpr bool kEven = false, kRounds = true;  // tiles begin with the first row of a pair
+  static constexpr bool kEven = false, kRounds = true;  // a tile starts at the first row of a pair
 
   static VLA_INLINE std::int64_t place(std::int64_t r, std::int64_t k) {
     return r / 2 * 2 * kXStride + r % 2 * kQuad + 2 * k;
@@ -43,7 +43,7 @@ struct NeonBf16Tile {
     std::memcpy(to, &numbers, left >= V::width ? sizeof(numbers) : static_cast<std::size_t>(left) * sizeof(*to));
   }
 
-  // n elements of a row, and zeros up to a multiple of 32.
+  // Writes n elements of a row, padded with zeros to a multiple of 32.
   static VLA_INLINE void copy(const float* from, std::int64_t n, X* to) {
     for (std::int64_t k = 0; k < round_up(n, kPanelDepth); k += kQuad, to += 2 * kQuad)
       store_rounded(to, k < n ? load<V>(from + k, n - k) : V::Float{}, kQuad);
@@ -62,7 +62,7 @@ struct NeonBf16Tile {
                              panel, n_step, c, add, {ahead.from, ahead.size / n_step});
   }
 
-  /// Panels of quads: four elements of each column after the other.
+  /// Panels of quads: four elements of each column in turn.
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
     constexpr std::int64_t kSize = sizeof(X);
     const std::int64_t panel = Panels<kColumns>::size(DType::bf16, round_up(desc.d_in, kPanelDepth));
@@ -78,7 +78,8 @@ struct NeonBf16Tile {
   static constexpr std::int64_t kQuad = kMmlaStep / std::int64_t{sizeof(X)};
 };
 
-/// Few rows, which are bound by reading weights: x stays as it is. 4 rows by 4 vectors, four of the depth at a time.
+/// For few rows, where reading weights is the bottleneck; x stays float32. 4 rows by 4 vectors, four steps of the depth
+/// at a time.
 struct QuadTile {
   using V = Neon;
   using X = float;
@@ -106,7 +107,7 @@ struct QuadTile {
       for (int r = 0; r < kCount; ++r) rows[r] = V::load(x + r * kXStride);
 #pragma GCC unroll 4
       for (int n = 0; n < kVectors; ++n) {
-        V::Int quads[2];  // of two columns each
+        V::Int quads[2];  // two columns each
         std::memcpy(quads, panel + 32 * n, sizeof(quads));
         const V::Int first = vuzp1q_s32(quads[0], quads[1]), second = vuzp2q_s32(quads[0], quads[1]);
         multiply_add<0>(first << 16, rows, sums[n]);
@@ -124,7 +125,7 @@ struct QuadTile {
       }
   }
 
-  /// As instructions, as in neon_multiply_add.h.
+  /// Written as assembly for the reason given in neon_multiply_add.h.
   template <int k, int kCount>
   static VLA_INLINE void multiply_add(V::Int numbers, const V::Float (&rows)[kCount], V::Float (&sums)[kCount]) {
     if constexpr (kCount == kRows)

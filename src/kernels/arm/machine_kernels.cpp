@@ -4,7 +4,7 @@
 
 namespace vla::kernels {
 
-// Each in the file of its name.
+// Each is defined in the file of its name.
 extern const LinearKernel kLinearNeonBf16, kLinearNeon;
 extern const LinearKernel kTernaryI8mm, kTernaryDotprod, kInt4I8mm, kInt4Dotprod, kInt8I8mm, kInt8Dotprod;
 extern const CpuKernels kNeonKernels;

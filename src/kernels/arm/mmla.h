@@ -8,19 +8,19 @@
 
 #include "kernels/sizes.h"
 
-/// Tiles of BFMMLA and SMMLA. An instruction multiplies two rows of x by two columns of a panel, eight bytes of each:
-/// four bf16, or eight codes. So x lies in pairs of rows and a panel in pairs of columns, eight bytes of the one and
-/// eight of the other. A panel has 16 columns: a step of eight bytes is 128 bytes of it. Only files that are compiled
-/// for these instructions may include this.
+/// Tiles for BFMMLA and SMMLA. An instruction multiplies two rows of x by two columns of a panel, eight bytes of each:
+/// four bf16 or eight codes. x is stored as pairs of rows and a panel as pairs of columns, alternating eight bytes of
+/// each. A panel has 16 columns, so a step of eight bytes is 128 bytes. Include this only in files compiled for these
+/// instructions.
 namespace vla::kernels {
 
-/// Part of a row or a column that an instruction takes, in bytes.
+/// Bytes of a row or column per instruction.
 constexpr std::int64_t kMmlaStep = 8;
 constexpr int kMmlaRows = 6, kMmlaColumns = 16;
 
-/// A step of three pairs of rows by eight pairs of columns: sums in registers 8 to 31, rows in 0 to 2, columns in 3
-/// and 4. The loop is one piece of instructions, as GCC 12 moves a third of the sums between registers otherwise.
-/// `also`: what else is done in each step.
+/// A step of three pairs of rows by eight pairs of columns: sums in registers 8 to 31, rows in 0 to 2, columns in 3 and
+/// 4. The loop is one block of assembly, because GCC 12 otherwise moves a third of the sums between registers. `also`:
+/// extra instructions in each step.
 // clang-format off
 #define VLA_MMLA_SIX(op, type, s0, s1, s2, s3, s4, s5, n)                                                              \
   "ldp q3, q4, [%[b], #32 * " #n "]\n\t"                                                                               \
@@ -44,15 +44,14 @@ constexpr int kMmlaRows = 6, kMmlaColumns = 16;
         "v17", "v18", "v19", "v20", "v21", "v22", "v23", "v24", "v25", "v26", "v27", "v28", "v29", "v30", "v31")
 // clang-format on
 
-/// Memory that is read next: from where on, and how much of it for each step.
+/// What to prefetch: an address, and bytes per step.
 struct MmlaAhead {
   const std::byte* from;
   std::int64_t skip;
 };
 
-/// c [kMmlaColumns] x 2 kPairs rows = products, or += where `add`, over n_step steps. `stride`: bytes from a pair of
-/// rows to the next. `Op` has Sum, Vector (of sums), multiply(sums, rows, columns), and three_pairs(), which is
-/// VLA_MMLA_LOOP.
+/// c [kMmlaColumns] x 2 kPairs rows = products, or += if `add`, over n_step steps. `stride`: bytes between pairs of
+/// rows. `Op` has Sum, Vector (of sums), multiply(sums, rows, columns), and three_pairs(), which is VLA_MMLA_LOOP.
 template <class Op, int kPairs>
 VLA_INLINE void multiply_pairs(const std::byte* x, std::int64_t stride, const std::byte* panel, std::int64_t n_step,
                                typename Op::Sum* c, bool add, MmlaAhead ahead) {
@@ -74,7 +73,7 @@ VLA_INLINE void multiply_pairs(const std::byte* x, std::int64_t stride, const st
       }
     }
   }
-  // Two rows by two columns become rows again.
+  // Splits sums of two rows by two columns into rows.
 #pragma GCC unroll 3
   for (int r = 0; r < kPairs; ++r)
 #pragma GCC unroll 8
@@ -91,7 +90,7 @@ VLA_INLINE void multiply_pairs(const std::byte* x, std::int64_t stride, const st
     }
 }
 
-/// The same for n_row <= kMmlaRows; of an odd number it multiplies one more.
+/// The same for n_row <= kMmlaRows; an odd number is rounded up.
 template <class Op>
 VLA_INLINE void multiply_mmla(int n_row, const std::byte* x, std::int64_t stride, const std::byte* panel,
                               std::int64_t n_step, typename Op::Sum* c, bool add, MmlaAhead ahead) {

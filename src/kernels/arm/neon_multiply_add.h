@@ -6,9 +6,9 @@
 
 namespace vla::kernels {
 
-/// sums += four columns * element k of each row, of six rows in one piece of instructions: of intrinsics, or with the
-/// load by itself, GCC 12 moves sums from register to register and spills them, since 24 sums, six rows and the columns
-/// leave one register. `load` brings the columns from %14 to register %6 as floats; %15 is zero.
+/// sums += four columns * element k of each of six rows, as one block of assembly. With intrinsics, or with a separate
+/// load, GCC 12 moves and spills sums: 24 sums, six rows and the columns leave one register. `load` reads the columns
+/// at %14 into register %6 as floats; %15 is zero.
 // clang-format off
 #define VLA_NEON_MULTIPLY_ADD(load, from)                                                                              \
   typedef std::uint8_t Bytes __attribute__((vector_size(16), aligned(1)));                                             \
@@ -31,7 +31,7 @@ VLA_INLINE void multiply_add_halves(const void* from, const Neon::Float (&rows)[
                                     Neon::Float (&sums)[6]) {
   VLA_NEON_MULTIPLY_ADD("ldr %d6, %14\n\tfcvtl %6.4s, %6.4h", from);
 }
-/// The same for the first or the second of pairs of bf16.
+/// The same for the first or second element of pairs of bf16.
 template <int k>
 VLA_INLINE void multiply_add_firsts(const void* from, const Neon::Float (&rows)[6], Neon::Float zero,
                                     Neon::Float (&sums)[6]) {

@@ -1,8 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// Loops of multiply-adds on registers alone (probe/peak_probes.cpp): 28 sums, whatever they begin with, of products of
-// zeros.
+// Loops of multiply-adds on registers (probe/peak_probes.cpp): 28 sums of products of zeros.
 #include "kernels/machine_kernels.h"
 
 namespace vla::kernels {

@@ -11,7 +11,7 @@ namespace vla::kernels {
 struct Neon : Lanes<4> {
   static VLA_INLINE Float set(float x) { return vdupq_n_f32(x); }
   static VLA_INLINE Float fma(Float a, Float b, Float c) { return vfmaq_f32(c, a, b); }
-  // Of a number and NaN the second, where FMIN and FMAX give NaN.
+  // Returns the second operand if the first is NaN, where FMIN and FMAX return NaN.
   static VLA_INLINE Float min(Float a, Float b) { return a < b ? a : b; }
   static VLA_INLINE Float max(Float a, Float b) { return a > b ? a : b; }
   static VLA_INLINE float sum(Float x) { return vaddvq_f32(x); }
@@ -21,17 +21,17 @@ struct Neon : Lanes<4> {
   static VLA_INLINE Float look_up(const float (&table)[8], Int index) {
     uint8x16x2_t bytes;
     std::memcpy(&bytes, table, sizeof(bytes));
-    const Int four = (index & 7) * 0x04040404 + 0x03020100;  // where the four bytes of a number stand
+    const Int four = (index & 7) * 0x04040404 + 0x03020100;  // position of a number's four bytes
     return vreinterpretq_f32_u8(vqtbl2q_u8(bytes, std::bit_cast<uint8x16_t>(four)));
   }
-  /// An estimate of 8 bits and one correction, which leave 2^-16.
+  /// An 8-bit estimate and one Newton step: relative error 2^-16.
   static VLA_INLINE Float reciprocal(Float x) {
     const Float estimate = vrecpeq_f32(x);
     return estimate * vrecpsq_f32(x, estimate);
   }
   static VLA_INLINE Float fraction(Float x) {
     const Float whole = vrndmq_f32(x);
-    return whole == x ? Float{} : x - whole;  // zero of infinity too
+    return whole == x ? Float{} : x - whole;  // zero for infinity too
   }
   static VLA_INLINE Float times_power_of_two(Float y, Float x) {
     const Int n = vmaxq_s32(vminq_s32(vcvtmq_s32_f32(x), vdupq_n_s32(254)), vdupq_n_s32(-252)), half = n >> 1;
