@@ -47,8 +47,8 @@ struct Error {
   Code code = Code::internal;
   std::string where;     // file, key, tensor path or feature name
   std::string expected;  // may be empty where `found` says everything
-  std::string found;  // `nothing` if an empty text was found
-  std::string hint;  // what to do next, if that is known
+  std::string found;     // `nothing` if an empty text was found
+  std::string hint;      // what to do next, if that is known
 
   Error() = default;
   Error(Code c, std::string place, std::string wanted, std::string finding, std::string next = {})

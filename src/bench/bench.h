@@ -10,7 +10,7 @@ namespace vla::bench {
 /// What to measure, and how often.
 struct Request {
   std::string bundle;  // path of a bundle; empty: random weights
-  std::string arch;  // architecture of the random weights, at its published size
+  std::string arch;    // architecture of the random weights, at its published size
   DType dtype = DType::bf16;
   WorkloadSizes sizes;
   std::vector<int> steps;  // the report is of the last one; with several it has a fit; empty: the bundle's own

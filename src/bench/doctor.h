@@ -9,12 +9,12 @@ namespace vla::bench {
 /// What a machine offers a policy, and how busy it is.
 struct Machine {
   std::string cpu;
-  int n_core = 0;  // cores that this process may use
+  int n_core = 0;                    // cores that this process may use
   std::vector<std::string> kernels;  // as --kernels names them, best last
-  Roofs roofs;  // peak of all these cores
-  std::size_t free_memory = 0;  // bytes that a process may allocate, also under its control group's limit
-  std::string governor;  // frequency governor of the first core; empty if unknown
-  double load = 0;  // load average of the last minute
+  Roofs roofs;                       // peak of all these cores
+  std::size_t free_memory = 0;       // bytes that a process may allocate, also under its control group's limit
+  std::string governor;              // frequency governor of the first core; empty if unknown
+  double load = 0;                   // load average of the last minute
 };
 
 /// Measures for a second or two; the machine should be idle. Errors: device.
@@ -32,14 +32,14 @@ struct StageCheck {
 
 /// A policy on this machine. Times are medians of the rounds, in milliseconds.
 struct Checkup {
-  Report report;  // with all cores
+  Report report;                   // with all cores
   std::vector<StageCheck> stages;  // of the network; then "network"
-  double host = 0;  // work of the host: images, text, actions
+  double host = 0;                 // work of the host: images, text, actions
   double total = 0;
-  double cores = 0;  // cores that the rounds really had
-  double one_thread = 0;  // total on one thread; 0 if not measured
+  double cores = 0;                  // cores that the rounds really had
+  double one_thread = 0;             // total on one thread; 0 if not measured
   int horizon = 0;                   // rows of a chunk
-  double rate_hz = 0;  // rows per second; 0 if the bundle does not state it
+  double rate_hz = 0;                // rows per second; 0 if the bundle does not state it
   std::size_t predicted_memory = 0;  // bytes
 
   /// The faster number of threads: small networks are faster on one.

@@ -28,7 +28,7 @@ std::vector<std::string> numbered(const std::string& name, int count) {
 
 /// Where a prompt has the views' tokens, for networks that read them among text.
 struct ViewPlaces {
-  int count = 0;  // none: the network takes images separately
+  int count = 0;   // none: the network takes images separately
   int repeat = 0;  // tokens of a view
   bool behind = false;
 

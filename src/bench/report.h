@@ -25,9 +25,9 @@ struct Conditions {
 struct StageRow {
   std::string name;
   double p50 = 0, p90 = 0, min = 0;     // ms
-  Work work;  // zero for host stages
+  Work work;                            // zero for host stages
   double flop_rate = 0, byte_rate = 0;  // per second
-  double share_of_peak = 0;  // of the best round; shares exist for the CPU only
+  double share_of_peak = 0;             // of the best round; shares exist for the CPU only
   double share_of_peak_p50 = 0;
   double share_of_bandwidth = 0;
   double floor = 0;  // ms: the longer of arithmetic at peak and weights at bandwidth
@@ -44,7 +44,7 @@ struct Report {
   // names of the probes that shares refer to; the second is empty without int8 products
   std::string peak_name, int8_peak_name;
   std::string precision, arithmetic;  // precision of the large products, for programs and for people
-  double load = 0;  // ms from opening the bundle until it is ready
+  double load = 0;                    // ms from opening the bundle until it is ready
   Roofs before, after;
   MemoryUse predicted;
   ProcessMemory process;

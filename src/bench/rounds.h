@@ -26,7 +26,7 @@ struct Series {
   int n_step = 0;
   std::string peak_name, int8_peak_name;  // highest probe between the rounds
   std::vector<Round> rounds;
-  StageWork work;  // work of the network's stages
+  StageWork work;                                     // work of the network's stages
   std::vector<std::pair<std::string, double>> times;  // Device::times of the last round before the measured ones
 };
 

@@ -24,7 +24,7 @@ constexpr std::size_t kDigits = 16;
 constexpr std::string_view kEmbodimentsKey = "embodiments", kEmbodimentPrefix = "embodiment.";
 
 constexpr std::size_t kMaxRobots = 64;  // published checkpoints use up to 32
-constexpr std::size_t kMaxTag = 256;  // bytes; the longest tag that a request can carry
+constexpr std::size_t kMaxTag = 256;    // bytes; the longest tag that a request can carry
 
 /// XXH3-64 of a file that arrives in parts. The checksum's own digits, at byte `digits`, count as '0'.
 class Checksum {

@@ -25,9 +25,9 @@ struct Param {
   std::string name;
   Storage storage = Storage::matrix;
   std::vector<std::int64_t> shape;
-  Encoding encoding;  // encoding in the file; without a bundle float32 stands for any float dtype
+  Encoding encoding;                   // encoding in the file; without a bundle float32 stands for any float dtype
   const TensorInfo* source = nullptr;  // set if the bundle has a tensor that fits
-  const Param* scales = nullptr;  // a vector of scales, if the encoding has scales
+  const Param* scales = nullptr;       // a vector of scales, if the encoding has scales
 
   std::int64_t count() const;
   /// The shape of the bundle's tensor. Elements smaller than a byte are stored as bytes.

@@ -13,8 +13,8 @@ namespace vla {
 struct Description {
   struct View {
     std::string name, alias;  // the alias is empty if there is none
-    bool optional;  // an observation without it declares it absent
-    int width, height;  // pixels that the network sees; frames of any size are fitted
+    bool optional;            // an observation without it declares it absent
+    int width, height;        // pixels that the network sees; frames of any size are fitted
   };
   struct Number {
     std::string name, unit;  // the unit is empty if the bundle does not state it
@@ -31,7 +31,7 @@ struct Description {
 
   int horizon;  // rows of a chunk
   std::vector<Number> actions;
-  double rate_hz;  // rows per second, 0 if the bundle does not state it
+  double rate_hz;                       // rows per second, 0 if the bundle does not state it
   int solver_horizon, d_action_padded;  // rows and columns of the solver's start; a chunk has the first of them
   std::string solver, noise;            // kinds
   int n_step;

@@ -16,16 +16,16 @@
 namespace vla {
 
 struct EngineOptions {
-  int n_thread = 0;  // 0: every core that the process may use
-  std::string kernels;  // as open_device takes them; empty: the machine's best for the bundle's dtype
-  std::string model;  // name of a device's model, as open_model takes it; only with `dry`
-  std::string device;  // cpu, vulkan:N or cuda:N; empty: the CPU
+  int n_thread = 0;         // 0: every core that the process may use
+  std::string kernels;      // as open_device takes them; empty: the machine's best for the bundle's dtype
+  std::string model;        // name of a device's model, as open_model takes it; only with `dry`
+  std::string device;       // cpu, vulkan:N or cuda:N; empty: the CPU
   std::string tap_pattern;  // empty: nothing is recorded
   /// Values that replace the computed ones at taps: those of the network, or `pixels` and `state`.
   std::vector<Tap> inject = {};
-  bool dry = false;  // reserve memory without filling it: sizes are exact, and `act` must not be called
+  bool dry = false;             // reserve memory without filling it: sizes are exact, and `act` must not be called
   std::string embodiment = {};  // the robot's tag; empty if the bundle is for one robot
-  bool all_robots = false;  // loads every robot of the bundle; then `embodiment` is empty
+  bool all_robots = false;      // loads every robot of the bundle; then `embodiment` is empty
   std::function<void(const Graph&)> see_graph = {};  // called with the graphs of every plan before they are lowered
   /// Receives values at taps, most of them as soon as they are computed. ActionChunk::taps, which would keep all of
   /// them, stays empty.
@@ -42,9 +42,9 @@ struct MemoryUse {
 /// How the budget EngineOptions::memory is used, in bytes.
 struct MemoryBudget {
   std::size_t size = 0;
-  std::size_t process = 0;  // the process without the engine's memory; 0 on a GPU
+  std::size_t process = 0;   // the process without the engine's memory; 0 on a GPU
   std::size_t smallest = 0;  // the least budget that would work
-  std::size_t n_read = 0;  // read from the file in every act; 0: all matrices stay in memory
+  std::size_t n_read = 0;    // read from the file in every act; 0: all matrices stay in memory
 };
 
 /// A loaded bundle, ready to act: the device with the parameters, the bundle's robots, and their plans. It owns the
@@ -144,7 +144,7 @@ class Engine {
   std::string tap_pattern_;
   std::function<void(const Graph&)> see_graph_;
   TapVisitor see_tap_;
-  bool dry_, chose_kernels_;  // the user chose the kernels
+  bool dry_, chose_kernels_;         // the user chose the kernels
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads
   std::unique_ptr<Device> device_;   // goes after what it made

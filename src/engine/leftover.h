@@ -15,7 +15,7 @@ namespace vla {
 /// next chunk continues them.
 struct Leftover {
   std::vector<float> rows;  // the last rows of ActionChunk::normalized, in its columns
-  int delay = 0;  // how many of them the robot will have executed when the next chunk arrives
+  int delay = 0;            // how many of them the robot will have executed when the next chunk arrives
   /// Required for a guided policy, refused for others: how a row's weight falls after `delay` (zeros, ones, linear or
   /// exp), and the largest weight of the guidance.
   std::string schedule;
@@ -35,7 +35,7 @@ struct Steering {
 
 /// The sizes of a solve and of a chunk's rows.
 struct ChunkShape {
-  int horizon, d_action;  // columns that the network computes
+  int horizon, d_action;    // columns that the network computes
   int n_row, d_normalized;  // columns of ActionChunk::normalized
 };
 

@@ -33,7 +33,7 @@ struct Network {
 struct PlanContext {
   Device& device;
   std::string tap_pattern;
-  bool dry;  // sizes only, nothing is computed
+  bool dry;                               // sizes only, nothing is computed
   const std::vector<Tap>* injected = {};  // null: nothing
   std::function<void(const Graph&)> see_graph = {};
   TapVisitor see_tap = {};

@@ -41,9 +41,9 @@ struct ActionChunk {
   int horizon = 0;  // rows
   int d_action = 0;
   std::vector<float> actions;      // (horizon, d_action) in the robot's own units
-  std::vector<float> normalized;  // before unnormalization, as a Leftover takes it
+  std::vector<float> normalized;   // before unnormalization, as a Leftover takes it
   std::vector<std::string> notes;  // warnings about this answer
-  bool out_of_range = false;  // whether one of them says that the state is out of range
+  bool out_of_range = false;       // whether one of them says that the state is out of range
   Timing timing;
   std::vector<Tap> taps;
 };
@@ -107,7 +107,7 @@ class Robot {
   int horizon_ = 0, d_action_ = 0, d_state_ = 0;
   Slots tables_, constant_slots_;
   const Slot* conditions_ = nullptr;  // in tables_
-  Cache constants_;  // its index in constant_slots_
+  Cache constants_;                   // its index in constant_slots_
 };
 
 }  // namespace vla

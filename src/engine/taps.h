@@ -28,9 +28,9 @@ Result<std::vector<Tap>> read_taps(const std::string& file);
 /// The difference of one recorded value from the expected one.
 struct TapDifference {
   std::string path;
-  double max_abs = 0;  // largest difference of two elements
-  double relative = 0;  // the same, divided by the largest expected magnitude
-  double cosine = 1;  // cosine of the two values as vectors
+  double max_abs = 0;      // largest difference of two elements
+  double relative = 0;     // the same, divided by the largest expected magnitude
+  double cosine = 1;       // cosine of the two values as vectors
   bool comparable = true;  // same shape and all values finite
   bool within(double tolerance) const { return comparable && relative <= tolerance; }
 };

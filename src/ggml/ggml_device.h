@@ -105,7 +105,7 @@ class GgmlDevice final : public Device {
     std::vector<Working> working;  // the last one serves new programs, earlier ones belong to older programs
     ggml_backend_buffer_ptr staging;
     std::shared_ptr<void> windows;  // GgmlWindows::held
-    Held* next = nullptr;  // of programs that are not freed
+    Held* next = nullptr;           // of programs that are not freed
   };
   ggml_type resident_type(const Param& param) const;
 

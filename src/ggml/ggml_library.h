@@ -11,7 +11,7 @@ namespace vla {
 /// Describes a ggml backend for a library of devices.
 struct GgmlBackend {
   const char* kind;                                  // "vulkan"
-  ggml_backend_reg_t (*open)();  // null if the driver is missing
+  ggml_backend_reg_t (*open)();                      // null if the driver is missing
   std::string (*driver)(ggml_backend_dev_t device);  // its name and version
   bool keeps_f16 = false;                            // its products of f16 weights are as exact as those of float32
 

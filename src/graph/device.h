@@ -111,8 +111,8 @@ struct WeightPlan {
   /// Matrices that are read from the bundle's file in every act, in groups, in the order in which the prefix reads
   /// them. If empty, all matrices stay in memory.
   std::vector<std::vector<const Param*>> streamed;
-  std::size_t window = 0;  // bytes of memory for the largest group
-  std::size_t n_read = 0;  // bytes that an act reads from the file
+  std::size_t window = 0;    // bytes of memory for the largest group
+  std::size_t n_read = 0;    // bytes that an act reads from the file
   std::size_t smallest = 0;  // least memory for parameters, in bytes
 };
 

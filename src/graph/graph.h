@@ -38,7 +38,7 @@ struct Node {
   std::vector<Tensor> in;
   DType type;
   Shape shape;
-  std::string path;  // path of the module that returned it, or empty
+  std::string path;     // path of the module that returned it, or empty
   bool tapped = false;  // whether `taps` keeps its values
 
   template <class T>

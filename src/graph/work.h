@@ -11,7 +11,7 @@ namespace vla {
 /// operation of the program, in its stored dtype, so a fused operation moves fewer.
 struct Work {
   double flop = 0, bytes = 0;
-  double int8 = 0;  // share of flop that multiplies int8 codes
+  double int8 = 0;     // share of flop that multiplies int8 codes
   double weights = 0;  // share of bytes that are parameters, which no cache keeps from run to run
 
   Work& operator+=(const Work& other) {

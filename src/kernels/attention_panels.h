@@ -25,9 +25,9 @@ class AttentionPanels {
         d_value(round_up(head, P::kMinPanel)) {}
 
   const std::int64_t d_head;
-  const std::int64_t n_key;  // keys, padded to whole panels
+  const std::int64_t n_key;      // keys, padded to whole panels
   const std::int64_t key_depth;  // elements of a key, padded to whole steps
-  const std::int64_t d_value;  // columns in all panels of features
+  const std::int64_t d_value;    // columns in all panels of features
 
   /// Elements in one unit.
   std::int64_t unit_size() const { return n_key * (key_depth + d_value); }

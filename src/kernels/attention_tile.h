@@ -74,7 +74,7 @@ class AttentionTile {
     alignas(64) float score[kBuffers * kBufferSize];
     alignas(64) Number query_number[kRows * kHeadStride];
     static constexpr int kRowVectors = round_up(kRows, kWidth);  // padded to whole vectors
-    alignas(64) float sum[kRowVectors * kWidth];  // sum of a row's weights, lane by lane
+    alignas(64) float sum[kRowVectors * kWidth];                 // sum of a row's weights, lane by lane
     // One value per row; weights are relative to the score `base`.
     alignas(64) float base[kRowVectors], minus_offset[kRowVectors], shrink[kRowVectors];
 
@@ -95,7 +95,7 @@ class AttentionTile {
       std::int64_t key = 0;
       int n = 0;
       Seen seen = Seen::none;
-      bool sum = false;  // adds to earlier chunks' output
+      bool sum = false;                    // adds to earlier chunks' output
       int first = 0, end = 0, buffer = 0;  // first row, number of rows, and the state with their scores
     };
     float* scores(const Pass& pass, int row) {

@@ -17,7 +17,7 @@ struct CpuKernels {
   /// Rotates the pairs (x_i, x_{i + n/2}); w has n/2 cosines followed by n/2 sines.
   RowKernel rotate_half;
   RowKernel add, multiply;  // y = x + w, x * w
-  RowKernel largest;  // y = max(x, w), NaN if either is NaN
+  RowKernel largest;        // y = max(x, w), NaN if either is NaN
   RowKernel multiply_add;   // y = x * w + b
   RowKernel scale;          // y = x * s
   AttentionKernel attention;

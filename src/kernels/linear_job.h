@@ -17,7 +17,7 @@ struct LinearJob {
   /// y = activation(W x + bias) * factor + residual, or the ReLU of that. y and residual are contiguous rows of d_out
   /// elements, one per row of x. bias [d_out], factor [d_out] and residual may be null.
   struct Part {
-    DType type;  // dtype of the stored weight
+    DType type;               // dtype of the stored weight
     const std::byte* weight;  // packed for its kernel
     const float* bias;
     const float* factor;

@@ -17,12 +17,12 @@ namespace vla {
 /// The heads of an attention. Their total width may differ from the model's.
 struct Heads {
   int n_head, n_head_kv, d_head;
-  Bias bias = Bias::no;  // whether queries, keys and values have biases
-  Bias out_bias = Bias::no;  // whether the output projection has a bias
+  Bias bias = Bias::no;                // whether queries, keys and values have biases
+  Bias out_bias = Bias::no;            // whether the output projection has a bias
   std::optional<float> norm_eps = {};  // RMS norm of queries and keys over each head
   Rule rule = Rule::floats;
   std::optional<float> sub_norm_eps = {};  // RMS norm over the concatenated heads, before the output projection
-  float rope_base = 0;  // 0: no rotary embedding by position
+  float rope_base = 0;                     // 0: no rotary embedding by position
   RotaryAngle rope_angle = RotaryAngle::product;
   bool plain_keys = false;  // keys have no bias, even if `bias` is set
 

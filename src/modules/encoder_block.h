@@ -10,7 +10,7 @@ namespace vla {
 /// What differs between families of encoders.
 struct EncoderFamily {
   Activation activation;  // of the MLP
-  bool scaled;  // attention and MLP are scaled feature by feature before they are added (LayerScale)
+  bool scaled;            // attention and MLP are scaled feature by feature before they are added (LayerScale)
   Rule rule = Rule::floats;
   bool plain_keys = false;  // keys have no bias
 };

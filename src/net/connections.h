@@ -14,9 +14,9 @@
 namespace vla::net {
 
 struct ConnectionLimits {
-  std::size_t message = 0;  // bytes in one request
+  std::size_t message = 0;      // bytes in one request
   std::size_t connections = 0;  // at once
-  std::size_t receipt = 0;  // bytes in all incomplete requests
+  std::size_t receipt = 0;      // bytes in all incomplete requests
 };
 
 /// The connections of a protocol and their common limits. A Connection has `standing()`, `has_answers()` and `drop(why,
@@ -26,7 +26,7 @@ struct Connections {
   Loop& loop;
   ConnectionLimits limits;
   std::map<std::uint64_t, std::shared_ptr<Connection>> connections = {};  // oldest first
-  std::size_t n_held = 0;  // bytes in incomplete requests
+  std::size_t n_held = 0;                                                 // bytes in incomplete requests
 
   /// Null if it has ended. The pointer keeps it alive while it is used.
   std::shared_ptr<Connection> find(std::uint64_t connection) const {

@@ -14,12 +14,12 @@ namespace vla::net {
 
 /// The facts about a connection that decide whether it gives way.
 struct Standing {
-  std::uint64_t connection = 0;  // rises with every new connection
-  std::string group;  // `group_of` the peer
-  bool is_open = false;  // its handshake is complete; with keys it is authenticated
+  std::uint64_t connection = 0;   // rises with every new connection
+  std::string group;              // `group_of` the peer
+  bool is_open = false;           // its handshake is complete; with keys it is authenticated
   Clock::time_point served = {};  // time of its last request
-  Clock::time_point began = {};  // when the request began that it is sending
-  std::size_t n_held = 0;  // bytes of that request so far
+  Clock::time_point began = {};   // when the request began that it is sending
+  std::size_t n_held = 0;         // bytes of that request so far
 };
 /// Oldest connection first.
 using Standings = std::vector<Standing>;

@@ -26,7 +26,7 @@ constexpr int kTimes = 1000;  // rows in the reference's time table
 class Evo1 final : public Policy {
   /// How padding in the prompt and image tokens of absent views are treated.
   enum class MaskedRows {
-    zero_attention,  // flash-attention: the row attends to nothing else, and the head sees it
+    zero_attention,    // flash-attention: the row attends to nothing else, and the head sees it
     causal_attention,  // other attention: the row sees the rows before it, and the head sees it
     unseen             // the head does not see it
   };

@@ -17,9 +17,9 @@ namespace vla {
 
 /// One observation, as the processor encodes it and the prefix reads it. It has no absent views and no text padding.
 struct PrefixInputs {
-  Tensor images;  // [width, height, 3, n_view], in the image recipe's range
-  Tensor tokens;  // [n_text] i32; none if the policy reads no instruction
-  Tensor state;  // [d_state, 1], normalized and padded; none if policy.d_state is 0
+  Tensor images;            // [width, height, 3, n_view], in the image recipe's range
+  Tensor tokens;            // [n_text] i32; none if the policy reads no instruction
+  Tensor state;             // [d_state, 1], normalized and padded; none if policy.d_state is 0
   std::uint32_t views = 0;  // bit i: view i of the bundle is present; 0 if only the number of views matters
 };
 
@@ -27,7 +27,7 @@ struct PrefixInputs {
 struct InputShape {
   int width = 0, height = 0, n_view = 0, n_text = 0, d_state = 0;
   std::uint32_t views = 0;  // as PrefixInputs::views
-  bool steered = false;  // whether the solver continues a previous chunk
+  bool steered = false;     // whether the solver continues a previous chunk
   auto operator<=>(const InputShape&) const = default;
 };
 

@@ -9,8 +9,8 @@ namespace vla {
 /// A policy prepared for quantization by what its matrices multiply.
 struct Calibrated {
   std::string bundle;  // the file to quantize: the smoothed one or the given one
-  std::string int4;  // the same with int4 codes that compensate each other's errors; empty if plain codes are better
-  std::string why;  // what was done, for `quantize`; empty if nothing
+  std::string int4;    // the same with int4 codes that compensate each other's errors; empty if plain codes are better
+  std::string why;     // what was done, for `quantize`; empty if nothing
   std::vector<std::string> told;  // what was tried
 };
 

@@ -11,7 +11,7 @@ namespace vla {
 namespace {
 
 constexpr std::int64_t kMaxRows = 128;  // rows kept of one value: tokens of an image are much alike
-constexpr double kDamping = 0.01;  // share of the columns' mean square that is added to all: GPTQ's percdamp
+constexpr double kDamping = 0.01;       // share of the columns' mean square that is added to all: GPTQ's percdamp
 
 /// Calls f(first column, columns, offset of the stretch's matrix) for each stretch.
 template <class F>

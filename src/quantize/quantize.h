@@ -16,9 +16,9 @@ namespace vla {
 /// The result for the matrices of one module (the first level of their paths).
 struct QuantizedModule {
   std::string path;
-  int n_matrix = 0;  // how many were quantized
+  int n_matrix = 0;                    // how many were quantized
   std::int64_t before = 0, after = 0;  // bytes in both files, of everything in the module
-  double error = 0;  // root mean square of the quantization error over that of the matrices
+  double error = 0;                    // root mean square of the quantization error over that of the matrices
 };
 
 struct QuantizeProgress {

@@ -11,7 +11,7 @@ namespace vla {
 
 /// How far quantization moves the chunks of some observations from float32, before unnormalization.
 struct Moved {
-  double rms = 0;  // root mean square of the differences, over that of the chunks
+  double rms = 0;      // root mean square of the differences, over that of the chunks
   double largest = 0;  // largest difference, over the largest magnitude
 };
 
@@ -31,7 +31,7 @@ Moved moved(const Chunks& expected, const Chunks& got);
 
 /// One of the two.
 struct Bound {
-  std::optional<double> error;  // largest allowed Moved::rms
+  std::optional<double> error;        // largest allowed Moved::rms
   std::optional<std::int64_t> bytes;  // largest allowed file
 };
 
@@ -39,7 +39,7 @@ struct Bound {
 struct Block {
   std::string path;
   std::int64_t stored = 0, int8 = 0, int4 = 0;  // bytes
-  double moved_by_int4 = 0;  // Moved::rms above that of int8 if only this block is int4
+  double moved_by_int4 = 0;                     // Moved::rms above that of int8 if only this block is int4
   double moved_by_int8 = 0;  // reduction of it if only this block stays unquantized; 0 if not measured
   Rounding codes = Rounding::int8;
 };
@@ -47,7 +47,7 @@ struct Block {
 struct Found {
   std::vector<Block> blocks;
   Moved all_int8, all_int4, moved;  // `moved`: with the chosen codes
-  int n_trial = 0;  // bundles loaded during the search
+  int n_trial = 0;                  // bundles loaded during the search
 };
 
 /// Chooses int4, int8 or the stored floats for every block: the fewest bytes within the error bound, or the least error

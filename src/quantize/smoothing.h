@@ -8,10 +8,10 @@ namespace vla {
 
 /// How much was smoothed, and what it was measured by.
 struct Smoothed {
-  int n_place = 0;  // norms and gated MLPs that only matrices of floats read
+  int n_place = 0;    // norms and gated MLPs that only matrices of floats read
   int n_channel = 0;  // how many of them were divided
   float largest = 1;  // factor
-  Chunks chunks;  // the observations' chunks in float32
+  Chunks chunks;      // the observations' chunks in float32
 };
 
 /// Writes a bundle of the same function whose activations and matrices lose less when they become codes. Where a

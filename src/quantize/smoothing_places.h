@@ -14,9 +14,9 @@ namespace vla {
 /// A place where channels can be divided, because every reader is a matrix whose columns can be multiplied: the result
 /// of a norm with weights, or a gated MLP's value before `down`.
 struct SmoothingPlace {
-  std::string path;  // path of the value's tap
+  std::string path;               // path of the value's tap
   const Param* weight = nullptr;  // weight of the norm or of the MLP's `up`, whose rows are divided
-  const Param* bias = nullptr;  // its bias, divided too; may be null
+  const Param* bias = nullptr;    // its bias, divided too; may be null
   std::set<const Param*> readers;
 };
 
@@ -33,7 +33,7 @@ class SmoothingPlaces {
 
   std::map<const Param*, SmoothingPlace> places_;  // by weight
   std::set<const Param*> refused_;                 // weights
-  Uses columns_, rows_;  // for matrices by place; for vectors only rows
+  Uses columns_, rows_;                            // for matrices by place; for vectors only rows
 };
 
 }  // namespace vla

@@ -16,10 +16,10 @@ namespace vla::zmtp {
 /// The peer of a connection.
 struct Client {
   std::uint64_t connection = 0;
-  std::string peer;  // the client's public key, or without keys its address, or `ipc` and its user
-  std::string name;  // the name in its hello
+  std::string peer;              // the client's public key, or without keys its address, or `ipc` and its user
+  std::string name;              // the name in its hello
   Clock::time_point since = {};  // since it connected
-  std::uint64_t n_request = 0;  // received so far
+  std::uint64_t n_request = 0;   // received so far
 };
 
 /// The sockets of a ZeroMQ ROUTER: listeners and connections. Everything runs inside the loop's `wait`, which never

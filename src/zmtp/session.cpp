@@ -14,12 +14,12 @@
 namespace vla::zmtp {
 namespace {
 
-constexpr unsigned kMore = 1, kLong = 2, kCommand = 4;  // flags of a frame
+constexpr unsigned kMore = 1, kLong = 2, kCommand = 4;   // flags of a frame
 constexpr unsigned kMoreInside = 1, kCommandInside = 2;  // flags inside a CURVE box
-constexpr int kMaxFrames = 1024;  // frames of a refused message that are skipped
+constexpr int kMaxFrames = 1024;                         // frames of a refused message that are skipped
 constexpr std::size_t kGreeting = 64, kMaxCommand = 4096;
-constexpr std::size_t kStep = 256 << 10;  // most bytes read at once, so that connections take turns
-constexpr std::size_t kPrefix = 64;  // bytes kept of a refused message: enough for its number
+constexpr std::size_t kStep = 256 << 10;     // most bytes read at once, so that connections take turns
+constexpr std::size_t kPrefix = 64;          // bytes kept of a refused message: enough for its number
 constexpr std::uint64_t kMaxSkip = 1 << 30;  // bytes of a refused frame that are skipped
 constexpr std::string_view kSignature("\xff\0\0\0\0\0\0\0\0\x7f", 10);
 

@@ -17,9 +17,9 @@ namespace vla::zmtp {
 
 /// One message of a peer.
 struct Message {
-  net::Bytes bytes;  // bytes of its frame; only the first ones if the message is refused
-  bool delimiter = false;  // an empty frame preceded it, as REQ sockets send
-  std::size_t size = 0;  // size that the peer announced
+  net::Bytes bytes;              // bytes of its frame; only the first ones if the message is refused
+  bool delimiter = false;        // an empty frame preceded it, as REQ sockets send
+  std::size_t size = 0;          // size that the peer announced
   std::optional<Error> refused;  // bad_request (several frames), too_large, out_of_memory
 };
 

@@ -15,12 +15,12 @@ namespace vla {
 
 /// What differs between the heads of the releases.
 struct GrootFamily {
-  bool state_rows;  // the state has `policy.n_state_row` rows, one per moment; each becomes a token
+  bool state_rows;     // the state has `policy.n_state_row` rows, one per moment; each becomes a token
   bool future_tokens;  // `policy.n_future` learned tokens between the state and the actions
-  bool mixing;  // `vl.n_layer` layers of self-attention over the context
-  bool alternating;  // even layers attend to text or images in turn (`dit.attend_text_every_n_blocks`), else to both
+  bool mixing;         // `vl.n_layer` layers of self-attention over the context
+  bool alternating;    // even layers attend to text or images in turn (`dit.attend_text_every_n_blocks`), else to both
                        // rows
-  bool norm = true;  // `context` normalizes and mixes the features, else it returns them
+  bool norm = true;    // `context` normalizes and mixes the features, else it returns them
   bool may_lack_state = false;  // `policy.d_state` may be 0: then there is no state token
 };
 

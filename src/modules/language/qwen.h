@@ -13,9 +13,9 @@ namespace vla {
 
 /// What differs between generations, and where features are read.
 struct QwenFamily {
-  Bias bias;  // biases of queries, keys and values
-  bool head_norms;  // norms of queries and keys over each head
-  bool final_norm;  // features are read after the final norm, else after the last layer
+  Bias bias;                                 // biases of queries, keys and values
+  bool head_norms;                           // norms of queries and keys over each head
+  bool final_norm;                           // features are read after the final norm, else after the last layer
   Activation activation = Activation::silu;  // activation of the gated MLP
   Rule rule = Rule::floats;
   bool sub_norms = false;  // RMS norm before both output projections

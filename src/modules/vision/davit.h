@@ -20,7 +20,7 @@ class Windows {
   /// Windows with the same number of cells of the map.
   struct Kind {
     int n_cell;             // of one window
-    int n_beyond;  // padding cells in a window
+    int n_beyond;           // padding cells in a window
     std::vector<int> cell;  // cells of all these windows in order: row * n_column + column
   };
   const std::vector<Kind>& kinds() const { return kinds_; }
