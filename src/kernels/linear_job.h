@@ -25,17 +25,17 @@ struct LinearJob {
     std::byte* y;
     std::int64_t d_out;
     const float* scale = nullptr;  // of a ternary weight, or of each column of an int8 one
-    DType y_type = DType::f32;     // or bf16, laid out as LinearKernel::rounded says
+    DType y_type = DType::f32;     // or bf16 in the layout of LinearKernel::rounded
   };
   static constexpr int kMaxPart = 3;
 
-  /// y = run(x); null where x is multiplied as it is.
+  /// The operation y = run(x) that comes before a product; null if x is multiplied as it is.
   struct Norm {
     RowKernel run = nullptr;
     const float *weight = nullptr, *bias = nullptr;
     float eps = 0;
 
-    /// The row x of n elements as it is multiplied, in `room` where it is normed.
+    /// Row x of n elements as the product reads it; `room` receives the norm if there is one.
     VLA_INLINE const float* operator()(const float* x, std::int64_t n, float* room) const {
       if (run == nullptr) return x;
       run(x, weight, bias, eps, room, n);
@@ -44,20 +44,20 @@ struct LinearJob {
   };
 
   const std::byte* x;     // n_row rows of d_in elements
-  std::int64_t x_stride;  // elements from one row to the next
-  Norm norm;              // what is multiplied is the norm of each row
-  Window window = {};     // where its size is not 0: rows are its places, and x the images under it, in float32
+  std::int64_t x_stride;  // stride of rows in elements
+  Norm norm;              // if set, the product reads the norm of each row
+  Window window = {};     // if its size is not 0: rows are the window's places over the images x, in float32
   std::int64_t n_row, d_in;
   int n_part;
   Part part[kMaxPart];
   Activation activation;
-  bool ends_in_relu = false;  // behind the residual
-  /// Two parts, gate and up, make one y, which is that of up: activation(gate) * up.
+  bool ends_in_relu = false;  // applied after the residual
+  /// Of two parts, gate and up, the result activation(gate) * up is stored in the y of up.
   bool gated;
-  /// f32, or bf16 where the kernel rounds what it multiplies, laid out as LinearKernel::rounded says, or i8: rows as
-  /// LinearKernel::quantize makes them, x_stride bytes apart.
+  /// f32; or bf16 in the layout of LinearKernel::rounded, if the kernel rounds its operands; or i8 rows of
+  /// LinearKernel::quantize, x_stride bytes apart.
   DType x_type;
-  // Made by LinearKernel::cut: groups of panels and, for tiles, rows of a block of x.
+  // Set by LinearKernel::cut: groups of panels and, for tiles, blocks of rows of x.
   std::int64_t n_group, block_rows;
 };
 

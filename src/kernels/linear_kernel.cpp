@@ -8,7 +8,7 @@
 namespace vla::kernels {
 
 extern const LinearKernel kLinearPortable, kTernaryPortable, kInt4Portable,
-    kInt8Portable;  // each in the file of its name
+    kInt8Portable;  // each is defined in the file of its name
 
 namespace {
 

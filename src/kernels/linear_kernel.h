@@ -11,7 +11,7 @@
 
 namespace vla::kernels {
 
-/// A weight matrix: d_out rows of d_in elements, one row after the other. Scales of codes are no part of it.
+/// A weight matrix: d_out consecutive rows of d_in elements, without scales.
 struct MatrixDesc {
   DType type;
   std::int64_t d_in, d_out;
@@ -20,31 +20,31 @@ struct MatrixDesc {
 /// No limit of a depth.
 constexpr std::int64_t kAnyDepth = std::int64_t{1} << 62;
 
-/// One implementation of the matrix product. Whatever it computes with, sums are float32.
+/// One implementation of the matrix product. All of them sum in float32 or exact integers.
 struct LinearKernel {
   const char* name;
   /// Bytes of the packed matrix.
   std::size_t (*packed_size)(const MatrixDesc& desc);
-  /// `stored` and `packed` start at multiples of 32 and 64 bytes.
+  /// `stored` and `packed` must be aligned to 32 and 64 bytes.
   void (*pack)(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
   bool (*supports)(const MatrixDesc& desc, Features use);
-  /// Cuts a job into items for so many threads, and says how many there are.
+  /// Splits a job into items for that many threads. Returns how many.
   std::int64_t (*cut)(LinearJob& job, int n_thread);
   void (*run)(const LinearJob& job, std::int64_t item, Worker& worker);
   std::size_t scratch_size;
-  std::int64_t max_norm;  // the widest norm of x that it computes on the way
-  /// How x may come, where the kernel would round it to bf16, and y leave, where who reads it would: y of products up
-  /// to this depth, as partial sums of deeper ones lie in y.
+  std::int64_t max_norm;  // the widest norm of x that the product can compute itself
+  /// Layout of bf16 that x may have if the kernel would round it anyway, and y if its reader would. Products deeper
+  /// than this store y as float32, since y holds their partial sums.
   RoundedLayout rounded = RoundedLayout::none;
   std::int64_t max_rounded_depth = 0;
-  /// The kernel for products of at most `max_small_batch` rows, from the same packed matrix; null where this one
-  /// computes them.
+  /// The kernel for at most `max_small_batch` rows, which reads the same packed matrix; null if this one computes them
+  /// too.
   const LinearKernel* small_batch = nullptr;
   std::int64_t max_small_batch = 0;
-  /// Makes a row of int8 codes (quantized.h) of n elements of x, where x must come as such rows. Else null.
+  /// Writes n elements of x as a row of int8 codes (quantized.h), if the kernel needs such rows. Else null.
   void (*quantize)(const float* x, std::int64_t n, std::byte* row) = nullptr;
-  /// Elements of x that the L2 cache keeps beside what passes through it, where x is read as the product before left
-  /// it; 0 where it is copied first.
+  /// How many elements of x stay in L2 while weights pass through it, for kernels that read x in place; 0 for kernels
+  /// that copy x first.
   std::int64_t l2_elements = 0;
   bool takes_windows = false;  // x may be images under a window
 
@@ -55,7 +55,7 @@ struct LinearKernel {
 /// The implementations, best first.
 std::span<const LinearKernel* const> linear_kernels();
 
-/// The first row that takes a matrix with no more than these features, or null.
+/// The first row of the table that takes this matrix and needs no other features, or null.
 const LinearKernel* choose_linear(const MatrixDesc& desc, Features use);
 
 }  // namespace vla::kernels

@@ -9,27 +9,27 @@
 
 /// The loops around a tile: items, cache blocking, edges, epilogue.
 ///
-/// A tile multiplies a few rows of x by the columns of a panel (linear_panels.h) over some depth of d_in. A block of
-/// rows of x is copied to rows of a fixed stride in the L2 cache, so that neither their addresses nor their width
-/// matter to the inner loop; then one panel after the other passes by, a step of the depth at a time, which stays in
-/// the L1 cache while all rows of the block are multiplied by it. Source of the method: Goto and van de Geijn,
-/// Anatomy of High-Performance Matrix Multiplication (2008).
+/// A tile multiplies a few rows of x by the columns of a panel (linear_panels.h) over some of the depth d_in. A block
+/// of rows of x is first copied into L2 with a fixed stride, so that the inner loop does not depend on their addresses
+/// or width. Then panels pass by, a step of the depth at a time; the step stays in L1 while all rows of the block are
+/// multiplied by it. Source of the method: Goto and van de Geijn, Anatomy of High-Performance Matrix Multiplication
+/// (2008).
 namespace vla::kernels {
 
-/// A part of a panel that will be multiplied next.
+/// The part of a panel that is multiplied next.
 struct Prefetch {
   const std::byte* from;
   std::int64_t size;
 };
 
-/// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kBlockRows (of the block
-/// of x), kMaxDepth and kXStride (how deep its rows may be, and from one to the next), kStep (of the depth, most),
-/// kRounds (x becomes bf16), kEven (tiles of equal height), and
-///   place(r, k)                       where element k of row r of the block lies, if not behind k others of its row
-///   copy(from, n, to)                 n elements of x, zeros up to a multiple of 32; where kRounds also from bf16
-///   store_rounded(to, vector, left)   y as bf16, where kRounds
+/// `Tile` has: V (a type of vec.h), X (the type that x becomes), kRows and kColumns (of the tile), kBlockRows (rows of
+/// a block of x), kMaxDepth and kXStride (largest depth and stride of the block's rows), kStep (largest step of the
+/// depth), kRounds (x becomes bf16), kEven (tiles of equal height), and
+///   place(r, k)                       offset of element k of row r in the block, if rows are not contiguous
+///   copy(from, n, to)                 copies n elements of x, zeros up to a multiple of 32; if kRounds also from bf16
+///   store_rounded(to, vector, left)   stores y as bf16, if kRounds
 ///   multiply(type, n_row, x, panel, depth, c, add, ahead)
-///     c [kColumns] x n_row <= kRows, += where `add`; prefetches ahead
+///     c [kColumns] x n_row <= kRows, += if `add`; prefetches `ahead`
 template <class Tile>
 concept LinearTile = requires(const float* from, std::int64_t n, typename Tile::X* to, const typename Tile::X* x,
                               const std::byte* panel, float* c, const Prefetch& ahead) {
@@ -58,17 +58,16 @@ class LinearLoop {
   static constexpr std::int64_t kMinItems = 16;                // for each thread, where there are so many
 
   struct Scratch {
-    // Which rows of x the block holds, and from which depth on: items of one block follow each other, so that a worker
-    // copies it once.
+    // The rows of x in the block and their first depth. Items of one block are consecutive, so a worker copies it once.
     std::int64_t row, depth;
-    alignas(64) X x[(kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows beyond the block
-    alignas(64) float row_of_x[Tile::kMaxDepth];             // as it is multiplied, where that is made on the way
+    alignas(64) X x[(kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows after the block
+    alignas(64) float row_of_x[Tile::kMaxDepth];             // a row as it is multiplied, if it is computed here
     alignas(64) float sums[(kBlockRows + kRows) * kColumns];
     alignas(64) float gates[(kBlockRows + kRows) * kGateColumns];
   };
 
  public:
-  /// The row of the table that this tile makes.
+  /// The kernel table's row for this tile.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use),
                                        const LinearKernel* small_batch = nullptr, std::int64_t max_small_batch = 0) {
     return {
@@ -91,7 +90,7 @@ class LinearLoop {
  private:
   static std::int64_t cut(LinearJob& job, int n_thread) {
     const LinearLoop loop(job);
-    // A group whose depth takes more than one block copies x again, which several panels must amortize.
+    // A group whose depth takes several blocks copies x again for each, so it needs several panels to amortize that.
     const std::int64_t min_panels = loop.whole_depth() ? 1 : 16;
     job.n_group =
         n_thread == 1 ? 1 : min(ceil_div(kMinItems * n_thread, loop.n_block_), ceil_div(loop.n_panel_, min_panels));
@@ -124,7 +123,7 @@ class LinearLoop {
 
   bool whole_depth() const { return block_depth_ >= job_.d_in; }
 
-  /// Some panels by a block of rows.
+  /// An item: some panels by a block of rows.
   void item(std::int64_t i) {
     const std::int64_t block = i / job_.n_group, group = i % job_.n_group;
     const std::int64_t row = block * block_rows_, n_row = min(block_rows_, job_.n_row - row);
@@ -141,7 +140,7 @@ class LinearLoop {
     }
   }
 
-  /// Rows [row, row + n_row) of x from depth k on, unless an item before left them here.
+  /// Copies rows [row, row + n_row) of x, starting at depth k, unless an earlier item left them here.
   void take_rows(std::int64_t row, std::int64_t n_row, std::int64_t k, std::int64_t depth) {
     if (row == scratch_->row && k == scratch_->depth) return;
     scratch_->row = row, scratch_->depth = k;
@@ -160,7 +159,8 @@ class LinearLoop {
     }
   }
 
-  /// Copies the window's elements at a place, from depth k on: if x stays as it is, straight to where it is multiplied.
+  /// Copies the window's elements at a place, starting at depth k; directly into the block if nothing else is done to
+  /// x.
   void take_place(std::int64_t place, std::int64_t k, std::int64_t depth, X* to) {
     const auto* images = reinterpret_cast<const float*>(job_.x);
     if constexpr (std::is_same_v<X, float>) {
@@ -172,8 +172,8 @@ class LinearLoop {
     }
   }
 
-  /// y of the stripe (+)= the block of x times the panel; `next` will be read after it. Whatever follows the product is
-  /// done while a tile of sums lies in the L1 cache.
+  /// y of the stripe (+)= the block of x times the panel; `next` is prefetched. The epilogue runs while a tile's sums
+  /// are in L1.
   void multiply(const Stripe& s, const std::byte* next) {
     const LinearJob::Part& part = job_.part[s.part];
     if (job_.gated)
@@ -187,7 +187,7 @@ class LinearLoop {
   }
 
   /// sums [kColumns] x n_row (+)= the block of x times a panel. `before` and `after` are called around the last step of
-  /// each tile with its first row and their number.
+  /// each tile with the tile's first row and number of rows.
   template <class Before, class After>
   VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, float* sums, bool add, const std::byte* next_panel,
                       const Before& before, const After& after) {
@@ -196,7 +196,7 @@ class LinearLoop {
     const std::byte* panel = Stripes::panel_of(job_, part, s.column, s.k);
     for (std::int64_t k = 0; k < depth; k += step) {
       const std::int64_t d = min(step, depth - k), size = Layout::size(part.type, d);
-      const std::byte* next = k + d < depth ? panel + size : next_panel;  // prefetched meanwhile
+      const std::byte* next = k + d < depth ? panel + size : next_panel;  // prefetched during this step
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
         if (k + d == depth) before(r, n_row);

@@ -5,14 +5,14 @@
 namespace vla::kernels {
 namespace {
 
-/// Words of a row to lines of a block; half a word may be left.
+/// Copies words of a row to lines of a block; a half word may remain.
 template <int kWord, int kLine>
 void put_words(const std::byte* from, std::int64_t size, std::byte* to) {
   for (; size >= kWord; size -= kWord, from += kWord, to += kLine) std::memcpy(to, from, kWord);
   if (size > 0) std::memcpy(to, from, static_cast<std::size_t>(size));
 }
 
-/// n elements of a row to a column of a block.
+/// Copies n elements of a row to a column of a block.
 void put(DType type, const std::byte* numbers, std::int64_t n, std::byte* column) {
   if (type == DType::f16) return put_words<2, 32>(numbers, 2 * n, column);
   put_words<4, 64>(numbers, n * number_size(type), column);

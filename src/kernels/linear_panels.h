@@ -8,17 +8,17 @@
 
 /// Memory layout of a packed matrix.
 ///
-/// A *panel* holds some columns of the product (rows of W) over the whole depth (d_in), one block of 1 KiB after the
-/// other. A block has 16 columns, and lines across them: a line of 64 bytes is two consecutive bf16 of every column, or
-/// one f32; a line of 32 bytes one f16. So a block is 32 deep, or 16 for f32. Panels of 32 columns alternate between
-/// the blocks of their two halves. Zeros fill what the matrix does not: the last columns, and the depth up to 32.
+/// A *panel* holds some columns of the product (rows of W) over the whole depth (d_in), as consecutive blocks of 1 KiB.
+/// A block has 16 columns, stored in lines across them: a line of 64 bytes holds two consecutive bf16 or one f32 of
+/// every column, a line of 32 bytes one f16. A block is therefore 32 deep, or 16 for f32. Panels of 32 columns
+/// alternate between blocks of their two halves. Missing columns, and the depth up to a multiple of 32, are zeros.
 ///
-/// Tiles of AMX read blocks as they are; vectors read lines.
+/// AMX tiles load whole blocks; vector kernels load lines.
 namespace vla::kernels {
 
 constexpr std::int64_t kPanelBlock = 1024, kPanelDepth = 32;
 
-/// n elements of a row of x, and zeros up to where a panel's depth may end.
+/// Copies n elements of a row of x, padded with zeros to a multiple of kPanelDepth.
 template <class X>
 VLA_INLINE void copy_padded(const X* from, std::int64_t n, X* to) {
   std::memcpy(to, from, static_cast<std::size_t>(n) * sizeof(X));
@@ -30,10 +30,10 @@ template <int kColumns>
 struct Panels {
   static_assert(kColumns == 16 || kColumns == 32);
 
-  /// Bytes over a depth that is a multiple of 32.
+  /// Bytes of a panel for a depth that is a multiple of 32.
   static VLA_INLINE std::int64_t size(DType type, std::int64_t depth) { return depth * kColumns * number_size(type); }
 
-  // A LinearKernel's functions.
+  // Functions of a LinearKernel.
   static std::size_t packed_size(const MatrixDesc& desc);
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
 

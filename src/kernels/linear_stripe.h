@@ -8,32 +8,32 @@
 #include "kernels/rounded.h"
 #include "kernels/sizes.h"
 
-/// The common part of the loops of products: how a job is cut into stripes and tiles, and all that follows a product.
+/// What all product loops share: how a job is split into stripes and tiles, and the epilogue.
 namespace vla::kernels {
 
-/// One panel's columns of a part by the rows of a block of x, over a part of the depth.
+/// The columns of one panel by the rows of a block of x, over a part of the depth.
 struct Stripe {
   int part;
   std::int64_t column, n_column, row = 0, n_row = 0, k = 0, depth = 0;
   float* gates = nullptr;  // [kColumns] x n_row
 };
 
-/// `Tile` as the loop describes it. It has a type of its own in each file, so that the linker cannot merge what was
-/// compiled for different instructions. kLayout: of a y that is rounded, by the tile's store_rounded,
-/// a vector or, where two are kColumns wide, a row at a time.
+/// `Tile`: see the loop. It has a distinct type in each file, so that the linker cannot merge functions compiled for
+/// different instructions. kLayout: how store_rounded of the tile stores y as bf16: one vector at a time, or a row at a
+/// time if two vectors are kColumns wide.
 template <class Tile, RoundedLayout kLayout = RoundedLayout::none>
 struct LinearStripes {
   using V = typename Tile::V;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns;
 
-  /// Panels of a job. The gate is no part of its own.
+  /// Panels in a job. The gate's panels are not counted separately.
   static std::int64_t n_panel(const LinearJob& job) {
     std::int64_t n = 0;
     for (int i = first_part(job); i < job.n_part; ++i) n += ceil_div(job.part[i].d_out, kColumns);
     return n;
   }
 
-  /// The part and the columns of panel `panel` of a job; the rest of the stripe is to be filled in.
+  /// The part and columns of panel `panel` of a job. The caller fills in the rest of the stripe.
   static Stripe of_panel(const LinearJob& job, std::int64_t panel) {
     int part = first_part(job);
     for (; panel >= ceil_div(job.part[part].d_out, kColumns); ++part) panel -= ceil_div(job.part[part].d_out, kColumns);
@@ -41,7 +41,7 @@ struct LinearStripes {
     return {.part = part, .column = column, .n_column = min(kColumns, job.part[part].d_out - column)};
   }
 
-  /// A part's panel at a column, from depth k on.
+  /// A part's panel at a column, starting at depth k.
   static const std::byte* panel_of(const LinearJob& job, const LinearJob::Part& part, std::int64_t column,
                                    std::int64_t k) {
     using Layout = Panels<kColumns>;
@@ -49,8 +49,9 @@ struct LinearStripes {
            Layout::size(part.type, k);
   }
 
-  /// The weights that an item reads behind panel `panel` at depths from k to k + depth; it takes panels begin to end,
-  /// block of the depth by block. Behind its last block those that an item beside it begins with.
+  /// The weights that an item reads after panel `panel` at depths k to k + depth. An item takes panels begin to end for
+  /// one block of the depth, then for the next. After its last block these are the weights that the neighbouring item
+  /// starts with.
   static const std::byte* behind(const LinearJob& job, std::int64_t begin, std::int64_t end, std::int64_t panel,
                                  std::int64_t k, std::int64_t depth) {
     const bool ends_block = panel + 1 == end, goes_on = ends_block && k + depth < job.d_in;
@@ -60,12 +61,12 @@ struct LinearStripes {
     return panel_of(job, job.part[job.gated ? 0 : s.part], s.column, goes_on ? k + depth : ends_block ? 0 : k);
   }
 
-  /// The first row of tile t of `n_row` rows: tiles are of nearly equal height, or whole but for the last.
+  /// The first row of tile t of `n_row` rows. Tiles have nearly equal heights, or are full except for the last.
   static VLA_INLINE std::int64_t first_row(std::int64_t n_row, std::int64_t t) {
     return Tile::kEven ? n_row * t / ceil_div(n_row, kRows) : min(t * kRows, n_row);
   }
 
-  /// Asks for what finish() will read and write of a tile.
+  /// Prefetches what finish() reads and writes for a tile.
   static VLA_INLINE void fetch(const LinearJob& job, const Stripe& s, std::int64_t r, std::int64_t n_row) {
     const LinearJob::Part& part = job.part[s.part];
     const std::int64_t place = (s.row + r) * part.d_out + s.column, size = number_size(part.y_type);
@@ -74,9 +75,9 @@ struct LinearStripes {
       fetch<0>(reinterpret_cast<const std::byte*>(part.residual + place), n_row, part.d_out * 4);
   }
 
-  /// Finishes a tile's sums [kColumns] x n_row, rows first to first + n_row of the stripe: behind the last block of the
-  /// depth with everything that follows the product, before it as partial sums in y. Some rows of the tile may be
-  /// finished now and others later.
+  /// Finishes a tile's sums [kColumns] x n_row, rows first to first + n_row of the stripe: applies the epilogue after
+  /// the last block of the depth, before that stores partial sums in y. Rows of a tile may be finished in several
+  /// calls.
   class Finish {
    public:
     Finish() = default;
@@ -93,7 +94,7 @@ struct LinearStripes {
 
     VLA_INLINE void operator()(std::int64_t begin, std::int64_t end) const { (this->*rows_)(begin, end); }
 
-    /// Asks for what rows begin to end, or those of them that there are, will read and write as floats.
+    /// Prefetches what rows begin to end, as far as they exist, read and write as floats.
     VLA_INLINE void fetch(std::int64_t begin, std::int64_t end) const {
       end = min(end, n_row_);
       if (begin < end && job_->part[s_.part].y_type == DType::f32)
@@ -151,7 +152,7 @@ struct LinearStripes {
 
     template <bool kWhole, bool kRounded, Activation kActivation>
     void write(std::int64_t begin, std::int64_t end) const {
-      const Finish own = *this;  // which no store through a pointer changes
+      const Finish own = *this;  // local copies, which no store through a pointer can change
       own.write_rows<kWhole, kRounded, kActivation>(begin, end);
     }
 
@@ -177,7 +178,7 @@ struct LinearStripes {
       }
     }
 
-    /// The elements of a row from its column i on.
+    /// A row's elements, starting at column i.
     template <bool kWhole, bool kRounded, Activation kActivation>
     VLA_INLINE typename V::Float value_at(std::int64_t i_row, std::int64_t i) const {
       const std::int64_t r = first_ + i_row, place = (s_.row + r) * d_out_ + s_.column + i;
@@ -198,13 +199,13 @@ struct LinearStripes {
       return value;
     }
 
-    /// The destination of the stripe's elements of a row.
+    /// Where the stripe's elements of a row are stored.
     template <bool kWhole>
     VLA_INLINE std::uint16_t* rounded_row(std::int64_t row, std::int64_t d_out) const {
       auto* y = reinterpret_cast<std::uint16_t*>(y_);
       if constexpr (kLayout == RoundedLayout::rows) return y + row * d_out + s_.column;
       y += place_in_tiles(row, s_.column, d_out);
-      if constexpr (!kWhole) std::memset(y, 0, kTileSide * sizeof(*y));  // what is beyond the last column
+      if constexpr (!kWhole) std::memset(y, 0, kTileSide * sizeof(*y));  // columns after the last one
       return y;
     }
 
@@ -214,7 +215,7 @@ struct LinearStripes {
     const float* sums_ = nullptr;
     std::int64_t first_ = 0, n_row_ = 0, d_out_ = 0;
     float* y_ = nullptr;
-    // Of what follows the product, null where nothing does.
+    // The operands of the epilogue, null for missing ones.
     const float *bias_ = nullptr, *factor_ = nullptr, *residual_ = nullptr, *gates_ = nullptr, *gate_bias_ = nullptr;
     bool ends_in_relu_ = false;
   };
@@ -227,7 +228,7 @@ struct LinearStripes {
  private:
   static int first_part(const LinearJob& job) { return job.gated ? 1 : 0; }
 
-  /// Lines of a tile that will be read, or written (kWrite = 1), when the product is there.
+  /// Prefetches a tile's lines for reading, or writing (kWrite = 1).
   template <int kWrite>
   static VLA_INLINE void fetch(const std::byte* tile, std::int64_t n_row, std::int64_t stride) {
     for (std::int64_t r = 0; r < n_row; ++r)

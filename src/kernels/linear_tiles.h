@@ -5,19 +5,19 @@
 #include "kernels/linear_panels.h"
 #include "kernels/linear_stripe.h"
 
-/// The loops around tile registers, which multiply so fast that everything else must be done beside them.
+/// The loops around tile registers. These multiply so fast that all other work must overlap with them.
 ///
-/// x is rounded to bf16, as PyTorch rounds the activations of a bf16 layer, and lies in tiles (rounded.h): where the
-/// product before left it so, as it is, else as a copy of some rows in the L2 cache. A block of rows is multiplied
-/// by one panel after the other, a step of the depth at a time, which stays in the L1 cache. What follows the sums
-/// of a square of 32 x 32 is done some rows at a time between the instructions that multiply later squares.
+/// x is rounded to bf16, as PyTorch rounds the activations of a bf16 layer, and stored in tiles (rounded.h): in place
+/// if the previous product stored it so, else as a copy of some rows in L2. A block of rows is multiplied by one panel
+/// after the other, a step of the depth at a time, which stays in L1. The epilogue of a square of 32 x 32 sums runs a
+/// few rows at a time between the instructions that multiply later squares.
 namespace vla::kernels {
 
 /// `Tile` has: V (a type of vec.h), Session (held while a thread works), and
-///   copy(from, n, to)                 n <= 32 elements of x, and zeros up to 32
-///   store_rounded(to, vector, left)   y as bf16; and (to, vector, vector) where 32 elements are two vectors
+///   copy(from, n, to)                 copies n <= 32 elements of x, padded with zeros to 32
+///   store_rounded(to, vector, left)   stores y as bf16; also (to, vector, vector) if 32 elements are two vectors
 ///   multiply(half, x, panel, n_square, c, add, between)
-///     a square c of sums, += where `add`, or its first 16 rows; calls between() n_square times
+///     a square c of sums, += if `add`, or its first 16 rows; calls between() n_square times
 template <class Tile>
 concept SquareTile = requires(const float* from, std::int64_t n, std::uint16_t* to, typename Tile::V::Float vector,
                               const std::uint16_t* x, const std::byte* panel, float* c, void (&between)()) {
@@ -39,31 +39,31 @@ class TileLoop {
   using Stripes = LinearStripes<Shape, RoundedLayout::tiles>;
   using Finish = typename Stripes::Finish;
 
-  static constexpr std::int64_t kMaxRows = 512;     // of a block: the more, the fewer times a panel is read
-  static constexpr std::int64_t kMaxX = 512 << 10;  // elements of x in a block, half of the L2 cache
-  static constexpr std::int64_t kMaxDepth = 2048;   // of such a block
-  static constexpr std::int64_t kStep = 512;        // of the depth: a panel's step stays in the L1 cache
-  static constexpr std::int64_t kRowsAhead = 4;     // of x and y, which memory is asked for
-  static constexpr std::int64_t kMinItems = 16;     // for each thread, where there are so many
-  // A greater depth takes several blocks, and an item keeps the sums of a group of panels from one to the next. Each
-  // group reads all of the block of x.
+  static constexpr std::int64_t kMaxRows = 512;     // rows of a block: more rows read a panel fewer times
+  static constexpr std::int64_t kMaxX = 512 << 10;  // elements of x in a block, half of L2
+  static constexpr std::int64_t kMaxDepth = 2048;   // rows of such a block
+  static constexpr std::int64_t kStep = 512;        // step of the depth: a panel's step stays in L1
+  static constexpr std::int64_t kRowsAhead = 4;     // elements of x and y to prefetch
+  static constexpr std::int64_t kMinItems = 16;     // per thread, if there are that many
+  // A greater depth takes several blocks. An item keeps the sums of a group of panels between them, and each group
+  // reads the whole block of x.
   static constexpr std::int64_t kSplitDepth = 1024, kSplitRows = 256, kMinGroup = 4, kMaxGroup = 24;
   static constexpr std::int64_t kMinSplitItems = 8;
   static constexpr std::int64_t kMaxSums = kMaxGroup * kSplitRows * kTileSide;
-  // So many bytes of weights come from memory for each block of rows, unless threads multiply the same panels at the
-  // same time: blocks may then be larger, and all threads share them evenly.
+  // Every block of rows reads all weights from memory, unless threads multiply the same panels at the same time. If
+  // they do, blocks may be larger, and the threads share the rows evenly.
   static constexpr std::int64_t kFarWeights = 16 << 20, kFarX = 640 << 10, kFarRows = 320;
 
   struct Scratch {
-    std::int64_t row, depth;  // which rows of x the copy holds, and from which depth on
+    std::int64_t row, depth;  // the rows of x in the copy, and their first depth
     alignas(64) X x[kFarX];
-    alignas(64) float row_of_x[kMaxDepth];  // as it is multiplied, where that is made on the way
-    alignas(64) float sums[kMaxSums];       // of a panel and the one before, or of a group
+    alignas(64) float row_of_x[kMaxDepth];  // a row as it is multiplied, if it is computed here
+    alignas(64) float sums[kMaxSums];       // sums of a panel and the one before, or of a group
     alignas(64) float gates[kMaxSums];
   };
 
  public:
-  /// The row of the table that this tile makes.
+  /// The kernel table's row for this tile.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use),
                                        const LinearKernel* small_batch = nullptr, std::int64_t max_small_batch = 0) {
     return {
@@ -112,7 +112,7 @@ class TileLoop {
         n_block_(ceil_div(job.n_row, block_rows_)),
         n_panel_(Stripes::n_panel(job)) {}
 
-  /// Few rows leave room for a greater depth.
+  /// Fewer rows allow a greater depth.
   static bool has_whole_depth(const LinearJob& job) {
     return job.d_in <= kMaxDepth || job.d_in <= kMaxX / round_up(job.n_row, kTileSide) / kTileSide * kTileSide;
   }
@@ -131,7 +131,7 @@ class TileLoop {
     return n == 0 ? kTileSide : round_up(ceil_div(job.n_row, n), kTileSide);
   }
 
-  /// Some panels by a block of rows.
+  /// An item: some panels by a block of rows.
   void item(std::int64_t i) {
     const std::int64_t block = i / job_.n_group, group = i % job_.n_group;
     row_ = block * block_rows_, n_row_ = min(block_rows_, job_.n_row - row_);
@@ -147,7 +147,7 @@ class TileLoop {
     finish_summed();
   }
 
-  /// Copies the block of x, unless an item before left it here.
+  /// Copies the block of x, unless an earlier item left it here.
   void take_rows() {
     if (row_ == scratch_->row && k_ == scratch_->depth) return;
     scratch_->row = row_, scratch_->depth = k_;
@@ -161,7 +161,7 @@ class TileLoop {
     }
   }
 
-  /// The same of images under a window.
+  /// The same for images under a window.
   void take_places() {
     for (std::int64_t r = 0; r < n_row_; ++r)
       for (std::int64_t i = 0; i < depth_; i += kMaxDepth) {
@@ -172,14 +172,14 @@ class TileLoop {
       }
   }
 
-  /// The square of x that begins at row r and element k of the block.
+  /// The square of x at row r and element k of the block.
   const X* square_of_x(std::int64_t r, std::int64_t k) const {
     if (job_.x_type != DType::bf16) return scratch_->x + place_in_tiles(r, k, depth_);
     return reinterpret_cast<const X*>(job_.x) + place_in_tiles(row_ + r, k_ + k, job_.d_in);
   }
 
-  /// One panel, and its gate's, with sums at a place of the scratch; `next` will be read after them. The stripe's depth
-  /// is all of it, since no partial sum goes to y.
+  /// Multiplies one panel, and its gate's, with sums in scratch memory; `next` is prefetched. The stripe's depth is the
+  /// whole depth, since y never holds partial sums.
   void multiply(std::int64_t panel, std::int64_t place, const std::byte* next) {
     Stripe s = Stripes::of_panel(job_, panel);
     s.row = row_, s.n_row = n_row_, s.depth = job_.d_in, s.gates = scratch_->gates + place;
@@ -188,7 +188,7 @@ class TileLoop {
     sum(part, s, scratch_->sums + place, next, k_ + depth_ == job_.d_in);
   }
 
-  /// sums (+)= the block of x times a panel. `finish`: these were the last, y is made of them.
+  /// sums (+)= the block of x times a panel. `finish`: the sums are complete and y is computed from them.
   void sum(const LinearJob::Part& part, const Stripe& s, float* sums, const std::byte* next_panel, bool finish) {
     const std::int64_t depth = round_up(depth_, kTileSide), step = even_block(depth, kStep, kTileSide);
     const std::int64_t n_tile = ceil_div(n_row_, kTileSide);
@@ -215,8 +215,8 @@ class TileLoop {
     n_finished_ = n_summed_;
   }
 
-  /// Work between the instructions that multiply a square: rows of squares before are finished, and memory that will be
-  /// needed soon is asked for. As many rows at a time as makes all calls for a panel alike.
+  /// Work between the instructions that multiply a square: finishes rows of earlier squares and prefetches. Each call
+  /// for a panel finishes about the same number of rows.
   class Between {
    public:
     VLA_INLINE Between(TileLoop& loop, std::int64_t n_call, const std::byte* next, std::int64_t size)
@@ -239,8 +239,8 @@ class TileLoop {
   const LinearJob& job_;
   Scratch* scratch_ = nullptr;
   const std::int64_t block_depth_, block_rows_, n_block_, n_panel_;
-  std::int64_t row_ = 0, n_row_ = 0, k_ = 0, depth_ = 0;  // of the block at hand
-  // Rows of the panel before, or of this one, whose sums are complete, and those of them that are finished.
+  std::int64_t row_ = 0, n_row_ = 0, k_ = 0, depth_ = 0;  // rows of the current block
+  // Rows of this panel or the one before whose sums are complete, and how many of them are finished.
   Finish finish_;
   std::int64_t n_summed_ = 0, n_finished_ = 0;
   std::int64_t n_finish_ = 0;  // at a time

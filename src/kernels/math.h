@@ -7,14 +7,14 @@
 /// Transcendental functions of a vector of float32, in float32 throughout. `V` is a type of vec.h.
 namespace vla::kernels {
 
-/// Two in the power of the integers n, -127 <= n <= 127; -127 gives zero.
+/// 2^n for integers -127 <= n <= 127; -127 gives zero.
 template <class V>
 VLA_INLINE typename V::Float power_of_two(typename V::Int n) {
   return std::bit_cast<typename V::Float>((n + 127) << 23);
 }
 
-/// e^x for x <= 0, zero below -87.68, where it leaves the normal floats: what a softmax needs, in float32 throughout.
-/// x = n ln 2 + rest with |rest| <= ln2 / 2. Two constants make ln 2, so that the rest is exact to float32.
+/// e^x for x <= 0, as softmax needs it; zero below -87.68, where it leaves the normal floats. x = n ln 2 + rest with
+/// |rest| <= ln2 / 2. ln 2 is split into two constants so that the rest is exact to float32.
 template <class V>
 VLA_INLINE typename V::Float exp_of_negative(typename V::Float x) {
   using Float = typename V::Float;
@@ -37,27 +37,28 @@ VLA_INLINE typename V::Float size_of(typename V::Float x) {
   return std::bit_cast<typename V::Float>(std::bit_cast<typename V::Int>(x) & 0x7fffffff);
 }
 
-/// SiLU and GELU's tanh form are x / (1 + 2^-s) with s = x (a + b x^2). Of y = |x|, and of s at y, they are
+/// SiLU and GELU's tanh form are x / (1 + 2^-s) with s = x (a + b x^2). With y = |x| and s at y this equals
 ///     max(x, 0) - y / (1 + 2^s),
-/// whose last step rounds once, subnormal results included. For those 2^s grows to 2^158: the divisor is kept times
-/// kUnit, so that nothing leaves the normal floats on the way.
+/// whose last step rounds once, also for subnormal results. There 2^s grows to 2^158, so the divisor is scaled by kUnit
+/// to stay within the normal floats.
 ///
-/// An error of s is one of 2^s relative to it. So the whole part n of s is taken away before anything is rounded: the
-/// product that makes s meets -n in one fused step, and what its factors had lost is added to the small rest.
+/// An error of s is a relative error of 2^s. Therefore the integer part n of s is subtracted before anything is
+/// rounded: one fused multiply-add computes the product and -n, and the rounding errors of its factors are added to the
+/// small rest.
 namespace sigmoid {
 
 constexpr float kUnit = 0x1p-40f;
-/// Added to a small number it leaves that, rounded to a whole n, in the last bits, where it makes the exponent of
-/// 2^n kUnit.
+/// Adding it to a small number rounds that to an integer n in the lowest bits, where n becomes the exponent of 2^n
+/// kUnit.
 constexpr float kShift = 0x1.8p23f + 127 - 40;
 
-/// |x|, but at most `limit`. A NaN stays one.
+/// min(|x|, limit). NaN stays NaN.
 template <class V>
 VLA_INLINE typename V::Float size_within(typename V::Float x, float limit) {
   return V::min(V::set(limit), size_of<V>(x));
 }
 
-/// p of 2^rest = 1 + rest p for |rest| <= 0.53, minimax: relative error 2^-27 of the whole.
+/// p in 2^rest = 1 + rest p for |rest| <= 0.53, minimax: relative error 2^-27 of 2^rest.
 template <class V>
 VLA_INLINE typename V::Float slope_of_power(typename V::Float rest) {
   typename V::Float p = V::fma(rest, V::set(0x1.439136p-13f), V::set(0x1.5facf6p-10f));
@@ -67,18 +68,18 @@ VLA_INLINE typename V::Float slope_of_power(typename V::Float rest) {
   return V::fma(p, rest, V::set(0x1.62e432p-1f));
 }
 
-/// max(x, 0) - y / (1 + 2^(n + rest)) with |rest| <= 0.53, 0 <= n <= 160 and `shifted` = n + kShift. Where y is the
-/// limit, from which on nothing is subtracted, a zero is: a quotient that underflows costs hundreds of cycles.
+/// max(x, 0) - y / (1 + 2^(n + rest)) with |rest| <= 0.53, 0 <= n <= 160 and `shifted` = n + kShift. At the limit of y
+/// it subtracts zero, because a quotient that underflows costs hundreds of cycles.
 template <class V>
 VLA_INLINE typename V::Float multiply(typename V::Float x, typename V::Float y, float limit, typename V::Float shifted,
                                       typename V::Float rest) {
   using Float = typename V::Float;
   const Float p = slope_of_power<V>(rest);
-  // From n = 24 on, the sum of 2^n and one loses the one. It comes back through p, whose inverse is 1.2 to 1.7.
+  // From n = 24 on, 2^n + 1 rounds to 2^n. The missing one comes back through p, whose inverse is 1.2 to 1.7.
   const Float power = std::bit_cast<Float>(std::bit_cast<typename V::Int>(shifted) << 23), sum = power + kUnit;
   const Float lost = V::fma(sum - power, V::set(-1.625f), V::set(1.625f * kUnit));
   const Float divisor = V::fma(p, V::fma(rest, power, lost), sum);
-  const Float positive = V::max(x * 0.0f, x);  // x itself where it is not finite
+  const Float positive = V::max(x * 0.0f, x);  // x itself if it is not finite
   const Float dividend = y < limit ? y : Float{};
   return V::fma(V::divide(dividend, divisor), V::set(-kUnit), positive);
 }
@@ -101,7 +102,7 @@ VLA_INLINE typename V::Float relu_squared(typename V::Float x) {
 template <class V>
 VLA_INLINE typename V::Float silu(typename V::Float x) {
   using Float = typename V::Float;
-  constexpr float kLimit = 109.0f;  // from there on the results are x and zero
+  constexpr float kLimit = 109.0f;  // beyond this the results are x and zero
   const Float y = sigmoid::size_within<V>(x, kLimit);
   const Float a = V::set(0x1.715476p+0f), low_a = V::set(0x1.4ae0cp-26f);
   const Float shifted = V::fma(y, a, V::set(sigmoid::kShift));
@@ -114,10 +115,10 @@ VLA_INLINE typename V::Float silu(typename V::Float x) {
 template <class V>
 VLA_INLINE typename V::Float gelu_tanh(typename V::Float x) {
   using Float = typename V::Float;
-  constexpr float kLimit = 10.8f;  // from there on the results are x and zero
+  constexpr float kLimit = 10.8f;  // beyond this the results are x and zero
   const Float y = sigmoid::size_within<V>(x, kLimit);
-  // y^2, a and b in two parts each. The first ones have so few bits that their a + b y^2 is exact.
-  constexpr float kCoarse = 0x1.8p18f;  // adding it rounds to a multiple of 2^-5
+  // y^2, a and b are split in two parts. The first parts have few enough bits for an exact a + b y^2.
+  constexpr float kCoarse = 0x1.8p18f;  // adding this constant rounds to a multiple of 2^-5
   const Float square = V::fma(y, y, V::set(kCoarse)) - kCoarse, low_square = V::fma(y, y, -square);
   const Float factor = V::fma(square, V::set(0x1.a5ap-4f), V::set(0x1.26aecp+1f));
   Float low_factor = V::fma(square, V::set(0x1.f3dd5cp-18f), V::set(0x1.0de73ap-22f));
@@ -127,11 +128,11 @@ VLA_INLINE typename V::Float gelu_tanh(typename V::Float x) {
   return sigmoid::multiply<V>(x, y, kLimit, shifted, rest);
 }
 
-/// 2^x for what is then rounded to bf16: relative error 2^-18, zero for minus infinity, NaN for NaN.
+/// 2^x for results that are rounded to bf16 afterwards: relative error 2^-18, zero for minus infinity, NaN for NaN.
 template <class V>
 VLA_INLINE typename V::Float exp2_for_bf16(typename V::Float x) {
   const typename V::Float rest = V::fraction(x);
-  // Minimax on 0 <= rest <= 1 with the value 1 at 0: a whole power of two is exact.
+  // Minimax on 0 <= rest <= 1, equal to 1 at 0, so that integer powers of two are exact.
   typename V::Float p = V::fma(rest, V::set(0x1.b7f842p-7f), V::set(0x1.abf784p-5f));
   p = V::fma(p, rest, V::set(0x1.ee248cp-3f));
   p = V::fma(p, rest, V::set(0x1.62d6c2p-1f));
@@ -139,7 +140,7 @@ VLA_INLINE typename V::Float exp2_for_bf16(typename V::Float x) {
   return V::times_power_of_two(p, x);
 }
 
-/// silu() and gelu_tanh() for results that are then rounded to bf16: relative error 2^-13.
+/// silu() and gelu_tanh() for results that are rounded to bf16 afterwards: relative error 2^-13.
 template <class V>
 VLA_INLINE typename V::Float silu_for_bf16(typename V::Float x) {
   return x * V::reciprocal(exp2_for_bf16<V>(x * -1.44269504f) + 1.0f);

@@ -9,7 +9,7 @@
 #include "bundle/bundle.h"
 #include "kernels/vec.h"
 
-/// The elements that matrices are stored as.
+/// The element types of stored matrices.
 namespace vla::kernels {
 
 VLA_INLINE float from_f16(std::uint16_t x) {

@@ -4,13 +4,13 @@
 
 #include <cstddef>
 
-/// Hints about memory that the system may ignore. Pages that are only partly inside are left alone.
+/// Hints to the system about memory, which it may ignore. Pages that are only partly inside are skipped.
 namespace vla {
 
-/// Large pages: fewer of them are looked up while weights and activations stream by, and fewer are made.
+/// Advises huge pages: fewer TLB misses and page faults.
 void want_large_pages(void* data, std::size_t size);
 
-/// The memory itself now, not at the first write.
+/// Faults the memory in now, not at the first write.
 void want_memory_now(void* data, std::size_t size);
 
 }  // namespace vla

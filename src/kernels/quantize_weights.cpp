@@ -1,7 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// Compiled with -ffp-contract=off: every machine makes the same codes.
+// Compiled with -ffp-contract=off, so every machine makes the same codes.
 #include "kernels/quantize_weights.h"
 
 #include <algorithm>
@@ -12,13 +11,13 @@
 namespace vla::kernels {
 namespace {
 
-constexpr float kMinScale = 1e-30f;  // 127 / max_abs is finite; values below it are as good as zero
-constexpr float kRound = 0x1.8p23f;  // adding it leaves an integer in the lowest bits, ties to even
+constexpr float kMinScale = 1e-30f;  // keeps 127 / max_abs finite; smaller values count as zero
+constexpr float kRound = 0x1.8p23f;  // adding this constant leaves an integer in the lowest bits, ties to even
 
-/// Widens a row, and gives its greatest value without sign: NaN or infinity where one is not finite.
+/// Widens a row and returns its largest magnitude; NaN or infinity if a value is not finite.
 template <DType kType>
 float widen(const std::byte* stored, std::int64_t n, float* row) {
-  std::int32_t max_abs = 0;  // without their signs, floats are ordered as integers are, and NaN is above them all
+  std::int32_t max_abs = 0;  // without signs, floats order like integers, with NaN above all
   for (std::int64_t k = 0; k < n; ++k) {
     row[k] = stored_number(kType, stored, k);
     max_abs = std::max(max_abs, std::bit_cast<std::int32_t>(row[k]) & 0x7fffffff);
@@ -32,9 +31,9 @@ float widen(DType type, const std::byte* stored, std::int64_t n, float* row) {
                               : widen<DType::bf16>(stored, n, row);
 }
 
-/// The codes of a block for values that are code * step, and the sum of squares of what they miss.
+/// The codes of a block for a step, and the sum of squared errors.
 float try_step(const float* x, float step, float* codes) {
-  constexpr int kLanes = 8;  // of sums, whose order is part of the result
+  constexpr int kLanes = 8;  // partial sums; their order is part of the result
   constexpr auto kMost = static_cast<float>(Int4Block::kMost);
   const float inverse = 1 / step;
   float missed[kLanes] = {};
@@ -50,8 +49,9 @@ float try_step(const float* x, float step, float* codes) {
   return sum;
 }
 
-/// The step with the least error of those that are a multiple of `unit`, and its codes: the step that the block's
-/// largest number needs, or a smaller one, which cuts that number and is finer for the others. 0 for a block of zeros.
+/// The step, a multiple of `unit`, with the least squared error, and its codes. Candidates are the step that the
+/// block's largest value needs and smaller ones, which clip that value and are finer for the others. 0 for a block of
+/// zeros.
 int best_step(const float* x, float unit, float* best_codes) {
   constexpr int kMaxStep = Int4Block::kMaxStep;
   float max_abs = 0, codes[Int4Block::kElements];
@@ -80,7 +80,7 @@ Int4Block packed(int step, const float* codes) {
   return block;
 }
 
-/// The scale that makes what is left of the row least: the values' projection on their codes.
+/// The scale with the least squared error for these codes: the projection of the values on the codes.
 float fitted_scale(const float* row, const Int4Block* blocks, std::int64_t n, float otherwise) {
   double product = 0, square = 0;
   for (std::int64_t k = 0; k < n; ++k) {
@@ -90,13 +90,13 @@ float fitted_scale(const float* row, const Int4Block* blocks, std::int64_t n, fl
   return square > 0 ? static_cast<float>(product / square) : otherwise;
 }
 
-/// What the blocks of a row share.
+/// What all blocks of a row share.
 struct Int4Row {
-  float unit;  // of which steps are multiples
+  float unit;  // steps are multiples of it
   bool is_finite;
 };
 
-/// Widens a row; one that is not finite, or is nearly zero, becomes zeros.
+/// Widens a row; a row that is not finite, or nearly zero, becomes zeros.
 Int4Row widen_for_int4(DType type, const std::byte* stored, std::int64_t d_in, float* row) {
   const float max_abs = widen(type, stored, d_in, row);
   const bool is_finite = max_abs <= std::numeric_limits<float>::max();
@@ -105,14 +105,14 @@ Int4Row widen_for_int4(DType type, const std::byte* stored, std::int64_t d_in, f
   return {is_zero ? 0 : max_abs / (Int4Block::kMost * Int4Block::kMaxStep), is_finite};
 }
 
-/// Columns whose errors later ones make good, of some rows.
+/// Rounds some rows of a stretch of columns, where later columns compensate the errors of earlier ones.
 class Stretch {
  public:
-  /// rows: the first one's element of the first column; feedback: [n, n].
+  /// rows: the first row's element of the first column; feedback: [n, n].
   Stretch(const float* rows, std::int64_t d_in, std::span<const float> units, const float* feedback, std::int64_t n)
       : rows_(rows), d_in_(d_in), units_(units), feedback_(feedback), n_(n), asked_(units.size() * size(n)) {}
 
-  /// Makes the blocks that begin at column `begin` of each row. blocks: that of the first row.
+  /// Makes the blocks of each row that start at column `begin`. blocks: those of the first row.
   void round(std::int64_t begin, Int4Block* blocks) {
     const std::size_t first = size(begin);
     std::vector<int> steps;
@@ -123,7 +123,7 @@ class Stretch {
       for (std::size_t k = 0; k < n; ++k) wanted[k] = row(r)[first + k] + asked(r)[first + k];
       steps.push_back(best_step(wanted, units_[r], unused));
     }
-    // Rows in the inner loop, so that a row of the feedback is read once.
+    // The inner loop runs over rows, so each row of the feedback is read once.
     for (std::size_t k = 0; k < n; ++k)
       for (std::size_t r = 0; r < units_.size(); ++r)
         codes[r * kElements + k] = round(r, first + k, static_cast<float>(steps[r]) * units_[r]);
@@ -137,7 +137,7 @@ class Stretch {
   const float* row(std::size_t r) const { return rows_ + static_cast<std::int64_t>(r) * d_in_; }
   float* asked(std::size_t r) { return asked_.data() + r * size(n_); }
 
-  /// The code of one element, whose error later columns of the row are asked to make good.
+  /// Rounds one element and adds its error's compensation to later columns of the row.
   float round(std::size_t r, std::size_t k, float step) {
     constexpr auto kMost = static_cast<float>(Int4Block::kMost);
     float* const more = asked(r);
@@ -154,7 +154,7 @@ class Stretch {
   std::span<const float> units_;
   const float* feedback_;
   std::int64_t n_;
-  std::vector<float> asked_;  // for every row, what was added to its columns
+  std::vector<float> asked_;  // for every row, the sum of what was added to its columns
 };
 
 }  // namespace

@@ -6,24 +6,24 @@
 
 namespace vla::kernels {
 
-/// A matrix of floats as int8: the greatest value of a row of W becomes 127, and scale * code is nearly the value.
-/// A row with a value that is not finite gets a scale that makes its products not finite.
-/// stored: d_out rows of d_in elements; codes the same in bytes; scales [d_out]; row: room for d_in elements.
+/// Quantizes a matrix of floats to int8: the largest magnitude in a row of W becomes 127, and value = scale * code,
+/// approximately. A row with a value that is not finite gets a scale that makes its products not finite. stored: d_out
+/// rows of d_in elements; codes: the same in bytes; scales [d_out]; row: buffer for d_in elements.
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, std::byte* codes,
                       float* scales, float* row);
 
-/// The same as int4: each block gets the step with which the squares of its errors sum to the least, and the row then
-/// the scale that fits its codes best. blocks: Int4Block::n_of(d_in) of a row; row: room for all their elements.
+/// Quantizes to int4: each block gets the step with the least squared error, then the row the scale that fits its codes
+/// best. blocks: Int4Block::n_of(d_in) per row; row: buffer for all their elements.
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, Int4Block* blocks,
                       float* scales, float* row);
 
-/// Columns so far apart are rounded as if they had nothing to do with each other.
+/// Columns of different stretches of this many columns are rounded independently.
 constexpr std::int64_t kStretch = 1024;
 
-/// The same where it is known what the matrix multiplies, from which follows how an error in one column is made good
-/// by those behind it. feedback: for each stretch of n <= kStretch columns an [n, n] matrix, whose row j says what is
-/// added to the columns k > j for an error of 1 in column j. Each block gets its step from what is then left of it, and
-/// codes column by column. rows: room for d_out * d_in floats.
+/// The same if it is known what the matrix multiplies, so that later columns can compensate an error in an earlier one.
+/// feedback: for each stretch of n <= kStretch columns an [n, n] matrix, whose row j says what to add to columns k > j
+/// for an error of 1 in column j. A block's step is chosen from its compensated values, then its codes column by
+/// column. rows: buffer for d_out * d_in floats.
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, const float* feedback,
                       Int4Block* blocks, float* scales, float* rows);
 

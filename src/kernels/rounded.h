@@ -4,30 +4,29 @@
 
 #include "kernels/sizes.h"
 
-/// How activations between two products lie in memory where both would round them to bf16 anyway.
+/// Layouts of activations between two products that would both round them to bf16.
 namespace vla::kernels {
 
-/// rows: one after the other. tiles: squares of 32 rows by 32 elements, those of the same rows one after the other, as
-/// the tile registers of AMX load them. What stands in rows beyond the last does not matter; elements beyond the last
-/// of a row are zeros.
+/// rows: contiguous rows. tiles: squares of 32 rows by 32 elements, consecutive for the same rows, as AMX tile
+/// registers load them. Rows after the last may hold anything; elements after the last of a row are zeros.
 enum class RoundedLayout { none, rows, tiles };
 
 constexpr std::int64_t kTileSide = 32;
 
-/// The place of element i of a row among tiles of rows of d elements.
+/// Offset of element i of a row in tiles of rows of d elements.
 constexpr VLA_INLINE std::int64_t place_in_tiles(std::int64_t row, std::int64_t i, std::int64_t d) {
   return row / kTileSide * kTileSide * round_up(d, kTileSide) + i / kTileSide * kTileSide * kTileSide +
          row % kTileSide * kTileSide + i % kTileSide;
 }
 
-/// The place of element i of a row among rows of d elements.
+/// Offset of element i of a row in rows of d elements.
 constexpr VLA_INLINE std::int64_t rounded_place(RoundedLayout layout, std::int64_t row, std::int64_t i,
                                                 std::int64_t d) {
   return layout == RoundedLayout::tiles ? place_in_tiles(row, i, d) : row * d + i;
 }
 
-/// Calls piece(i, place, count) for the parts of elements `column` to column + n of a row that lie together: count
-/// elements from the i-th on are at `place`.
+/// Calls piece(i, place, count) for each contiguous part of elements `column` to column + n of a row: count elements,
+/// starting with the i-th, are at `place`.
 template <class Piece>
 VLA_INLINE void for_pieces(RoundedLayout layout, std::int64_t row, std::int64_t column, std::int64_t n, std::int64_t d,
                            const Piece& piece) {
@@ -37,7 +36,7 @@ VLA_INLINE void for_pieces(RoundedLayout layout, std::int64_t row, std::int64_t 
   }
 }
 
-/// Elements that n_row rows of d take.
+/// Elements that n_row rows of d take in this layout.
 constexpr std::int64_t rounded_count(RoundedLayout layout, std::int64_t n_row, std::int64_t d) {
   return layout == RoundedLayout::tiles ? round_up(n_row, kTileSide) * round_up(d, kTileSide) : n_row * d;
 }

@@ -6,14 +6,14 @@
 
 #include "kernels/vec.h"
 
-/// How sizes are cut into blocks and rounded.
+/// How sizes are split into blocks and rounded.
 namespace vla::kernels {
 
 constexpr VLA_INLINE std::int64_t min(std::int64_t a, std::int64_t b) { return a < b ? a : b; }
 constexpr VLA_INLINE std::int64_t max(std::int64_t a, std::int64_t b) { return a > b ? a : b; }
 constexpr VLA_INLINE std::int64_t ceil_div(std::int64_t n, std::int64_t size) { return (n + size - 1) / size; }
 constexpr VLA_INLINE std::int64_t round_up(std::int64_t n, std::int64_t unit) { return ceil_div(n, unit) * unit; }
-/// The size of equal blocks that n is cut into, as few as `max` allows, each a multiple of `unit`.
+/// The block size that splits n into equal blocks, as few as `max` allows, each a multiple of `unit`.
 constexpr VLA_INLINE std::int64_t even_block(std::int64_t n, std::int64_t max, std::int64_t unit) {
   return n == 0 ? unit : round_up(ceil_div(n, ceil_div(n, max)), unit);
 }

@@ -4,7 +4,7 @@
 
 #include <utility>
 
-/// Tiles of a product are compiled height by height, so that their sums stay in registers.
+/// Tiles are compiled for each height separately, so that their sums stay in registers.
 namespace vla::kernels {
 
 template <class F>
@@ -21,8 +21,8 @@ struct TileOfHeight {
   }
 };
 
-/// Calls tile.operator()<height>(), from 1 to kMost. `F` has a type of its own in each file, so that the linker cannot
-/// merge what was compiled for different instructions.
+/// Calls tile.operator()<height>() for a height from 1 to kMost. `F` has a distinct type in each file, so that the
+/// linker cannot merge functions compiled for different instructions.
 template <int kMost, class F>
 inline void with_height(int height, const F& tile) {
   TileOfHeight<F>::call(height, tile, std::make_integer_sequence<int, kMost>());

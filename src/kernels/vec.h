@@ -6,15 +6,15 @@
 #include <cstdint>
 #include <cstring>
 
-/// Kernels are templates over one of the types below, which is never used outside a file that is compiled for its
-/// instructions. Everything they call is forced inline: a function of its own could be merged by the linker with the
-/// copy of a file that was compiled for a better machine.
+/// Kernels are templates over one of the types below. Each type is used only in files compiled for its instructions.
+/// Everything that kernels call is forced inline: the linker could merge an out-of-line function with a copy that was
+/// compiled for a better machine.
 #define VLA_INLINE inline __attribute__((always_inline))
-#define VLA_LAMBDA __attribute__((always_inline))  // behind a lambda's parameters
+#define VLA_LAMBDA __attribute__((always_inline))  // after a lambda's parameters
 
 namespace vla::kernels {
 
-/// `W` lanes in the compiler's vector extension. Arithmetic, comparisons and `mask ? a : b` are its operators.
+/// `W` lanes in the compiler's vector extension, whose operators provide arithmetic, comparisons and `mask ? a : b`.
 template <int W>
 struct Lanes {
   static constexpr int width = W;
@@ -28,7 +28,7 @@ struct Lanes {
     return x;
   }
   static VLA_INLINE void store(float* p, Float x) { std::memcpy(p, &x, sizeof(x)); }
-  /// The first `n` lanes, 0 <= n <= W, and zeros.
+  /// Loads the first `n` lanes, 0 <= n <= W; the others are zeros.
   static VLA_INLINE Float load_part(const float* p, int n) {
     Float x = {};
     std::memcpy(&x, p, static_cast<std::size_t>(n) * sizeof(float));
@@ -47,7 +47,7 @@ struct Lanes {
   }
 };
 
-/// A vector from p where `left` elements remain; lanes beyond them are zeros.
+/// Loads a vector from p, where `left` elements remain; lanes after them are zeros.
 template <class V>
 VLA_INLINE typename V::Float load(const float* p, std::int64_t left) {
   return left >= V::width ? V::load(p) : V::load_part(p, static_cast<int>(left));
@@ -57,8 +57,7 @@ VLA_INLINE void store(float* p, typename V::Float x, std::int64_t left) {
   left >= V::width ? V::store(p, x) : V::store_part(p, x, static_cast<int>(left));
 }
 
-/// As many vectors as each has lanes: lane j of vector i and lane i of vector j change places. Each round interleaves
-/// vectors half of the square apart.
+/// Transposes W vectors of W lanes: each round interleaves vectors half of the square apart.
 template <class V>
 VLA_INLINE void transpose(typename V::Float (&x)[V::width]) {
   constexpr int kHalf = V::width / 2;
@@ -75,7 +74,7 @@ VLA_INLINE void transpose(typename V::Float (&x)[V::width]) {
   }
 }
 
-/// In lane i all of x[i], put together by `join` (a sum, a maximum), which sees elements in an order of its own.
+/// Reduces each x[i] to lane i by `join` (a sum, a maximum). The order of elements is its own.
 template <class V, class Join>
 VLA_INLINE typename V::Float across(typename V::Float (&x)[V::width], Join join) {
 #pragma GCC unroll 4

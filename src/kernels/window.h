@@ -10,18 +10,17 @@
 
 namespace vla::kernels {
 
-/// A square of `size` pixels that moves over images of d elements a pixel, one image after the other, in steps of
-/// `stride` over `padding` more pixels at each side (op::Window). Places are numbered row by row, image by image.
+/// A square of `size` pixels that moves over images of d elements per pixel, image by image, in steps of `stride`, with
+/// `padding` pixels on each side (op::Window). Places are numbered row by row, image by image.
 struct Window {
   std::int64_t d, width, height;
   std::int64_t size, stride, padding;
-  std::int64_t n_column, n_row;  // places of an image
+  std::int64_t n_column, n_row;  // places per image
 
-  /// Elements that the window covers.
+  /// Elements inside the window.
   VLA_INLINE std::int64_t width_of_place() const { return d * size * size; }
 
-  /// Elements first to first + n - 1 of those that the window covers at a place, pixels row by row, zeros beyond the
-  /// image.
+  /// Copies elements first to first + n - 1 of the window at a place: pixels row by row, zeros outside of the image.
   VLA_INLINE void copy(const float* images, std::int64_t place, std::int64_t first, std::int64_t n, float* to) const {
     const Corner corner = corner_of(place);
     const std::int64_t line = d * size, end = first + n;
@@ -32,7 +31,7 @@ struct Window {
     }
   }
 
-  /// Writes for each element of a pixel the largest that the window covers inside the image.
+  /// Writes the maximum of each feature over the window's pixels inside the image.
   VLA_INLINE void largest(RowKernel larger, const float* images, std::int64_t place, float* to) const {
     bool is_first = true;
     for_covered(images, corner_of(place), [&](const float* pixel, std::int64_t) VLA_LAMBDA {
@@ -44,7 +43,7 @@ struct Window {
     });
   }
 
-  /// Writes for each element of a pixel the sum of what the window covers, times that element's weights, and its bias.
+  /// Writes for each feature the sum of the window's pixels times that feature's weights, plus its bias.
   /// `multiply_add`: y = x * w + b.
   VLA_INLINE void weigh(RowKernel multiply_add, const float* images, const float* weight, const float* bias,
                         std::int64_t place, float* to) const {
@@ -57,7 +56,7 @@ struct Window {
   }
 
  private:
-  /// The pixel under the window's upper left one, which may lie beyond the image.
+  /// The pixel at the window's upper left corner, which may be outside of the image.
   struct Corner {
     std::int64_t image, x, y;
   };
@@ -67,7 +66,7 @@ struct Window {
     return {place / n, place % n_column * stride - padding, place % n / n_column * stride - padding};
   }
 
-  /// Calls visit(pixel, its number in the window) for those inside the image.
+  /// Calls visit(pixel, its index in the window) for pixels inside the image.
   template <class Visit>
   VLA_INLINE void for_covered(const float* images, const Corner& corner, const Visit& visit) const {
     for (std::int64_t row = max(0, -corner.y); row < min(size, height - corner.y); ++row)
@@ -75,11 +74,11 @@ struct Window {
         visit(images + ((corner.image * height + corner.y + row) * width + corner.x + column) * d, row * size + column);
   }
 
-  /// Elements `from` to `until` of a row of the window.
+  /// Elements `from` to `until` of a window row.
   VLA_INLINE void copy_line(const float* images, const Corner& corner, std::int64_t row, std::int64_t from,
                             std::int64_t until, float* to) const {
     const std::int64_t y = corner.y + row;
-    // Of the row's elements those inside the image.
+    // The row's elements that are inside the image.
     const bool inside = y >= 0 && y < height;
     const std::int64_t begin = inside ? min(until, max(from, -corner.x * d)) : until;
     const std::int64_t end = inside ? max(begin, min(until, (width - corner.x) * d)) : until;

@@ -6,7 +6,7 @@
 namespace vla::kernels {
 namespace {
 
-/// Any machine's compiler makes something of it.
+/// Written for any compiler to vectorize.
 struct PortableTile {
   using V = Portable;
   static constexpr int kRows = 5, kColumns = 32, kBlockRows = 25, kStep = 128;
@@ -28,7 +28,7 @@ struct PortableTile {
   }
 
  private:
-  /// Element k of column n: a byte of the eight at a multiple of that.
+  /// Element k of column n, read from its aligned group of eight bytes.
   template <class Strips>
   static VLA_INLINE int number(const Strips& panel, std::int64_t k, int n) {
     const int place = n % 16 * 4 + static_cast<int>(k % 4);

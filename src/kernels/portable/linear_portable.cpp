@@ -7,15 +7,15 @@
 namespace vla::kernels {
 namespace {
 
-/// 3 rows by 4 vectors: with 12 sums, as many registers as the least of machines have for vectors, 16, are enough. A
-/// product and its sum are rounded one by one, and in the order of the depth, so that the bits are those of every
-/// machine.
+/// 3 rows by 4 vectors: 12 sums, which fit into the 16 vector registers that every machine has. Products and sums are
+/// rounded separately, in the order of the depth, so every machine gives the same bits.
 struct PortableTile {
   using V = Portable;
   using X = float;
   static constexpr int kRows = 3, kColumns = 16, kVectors = kColumns / V::width;
   static constexpr int kMaxDepth = 2048, kStep = 512, kBlockRows = 48;
-  static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
+  // not a multiple of a page, so that rows do not compete for the same cache lines
+  static constexpr int kXStride = kMaxDepth + 16;
   static constexpr bool kEven = true, kRounds = false;
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
@@ -36,7 +36,7 @@ struct PortableTile {
   using Float = V::Float;
   using Int = V::Int;
 
-  // How many steps of the depth a line of a panel holds, and four columns of one of them as floats.
+  // Steps of the depth per line of a panel, and four columns of one step as floats.
   struct Pairs {
     static constexpr int kDepth = 2, kSize = 64;
     static VLA_INLINE Float load(const std::byte* line, int k, int i) {
@@ -47,7 +47,7 @@ struct PortableTile {
   };
   struct Halves {
     static constexpr int kDepth = 1, kSize = 32;
-    /// The exponent's bias grows by 112, except that of what is not finite, which becomes the greatest.
+    /// Adds 112 to the exponent's bias; infinity and NaN get the largest exponent.
     static VLA_INLINE Float load(const std::byte* line, int, int i) {
       typedef std::uint16_t Words __attribute__((vector_size(8)));
       Words halves;

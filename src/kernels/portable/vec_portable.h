@@ -6,15 +6,15 @@
 
 namespace vla::kernels {
 
-/// Four lanes on every machine. Its multiply-add of floats is made in double, so that math.h is as exact where
-/// no instruction does.
+/// Four lanes on every machine. Its multiply-add computes in double, so that math.h is as exact without a fused
+/// instruction.
 struct Portable : Lanes<4> {
   static VLA_INLINE Float fma(Float a, Float b, Float c) {
     typedef double Doubles __attribute__((vector_size(8 * width)));
     const auto x = __builtin_convertvector(a, Doubles), y = __builtin_convertvector(b, Doubles);
     return __builtin_convertvector(x * y + __builtin_convertvector(c, Doubles), Float);
   }
-  /// `min` and `max` of a value and NaN are the second operand.
+  /// `min` and `max` with NaN return the second operand.
   static VLA_INLINE Float min(Float a, Float b) { return a < b ? a : b; }
   static VLA_INLINE Float max(Float a, Float b) { return a > b ? a : b; }
   static VLA_INLINE float max(Float x) {
@@ -22,10 +22,10 @@ struct Portable : Lanes<4> {
     for (int i = 1; i < width; ++i) most = x[i] > most ? x[i] : most;
     return most;
   }
-  /// The lower halves of a and b in turn, and the upper ones.
+  /// Interleaves the lower halves of a and b, and the upper halves.
   static VLA_INLINE Float interleave_low(Float a, Float b) { return Float{a[0], b[0], a[1], b[1]}; }
   static VLA_INLINE Float interleave_high(Float a, Float b) { return Float{a[2], b[2], a[3], b[3]}; }
-  /// Lane by lane the element of a table that the lowest three bits of an index say.
+  /// Looks up each lane in a table by the lowest three bits of its index.
   static VLA_INLINE Float look_up(const float (&table)[8], Int index) {
     Float y;
     for (int i = 0; i < width; ++i) y[i] = table[index[i] & 7];
@@ -33,7 +33,7 @@ struct Portable : Lanes<4> {
   }
   /// 1 / x with a relative error of at most 2^-14, zero for infinity.
   static VLA_INLINE Float reciprocal(Float x) { return 1.0f / x; }
-  /// x less the integer below it, and y times two to the power of that integer.
+  /// x - floor(x), and y * 2^floor(x).
   static VLA_INLINE Float fraction(Float x) {
     for (int i = 0; i < width; ++i) x[i] = __builtin_isinf(x[i]) ? 0.0f : x[i] - __builtin_floorf(x[i]);
     return x;

@@ -1,9 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// Loops of multiply-adds on registers alone. In every loop the sums are as many as the registers allow, so that no
-// multiply-add waits for the one before it, and each starts from another value, so that no compiler finds two of them
-// equal.
+// Loops of multiply-adds on registers. Each loop has as many sums as registers allow, so that no multiply-add waits for
+// the one before; each sum starts at another value, so that no compiler finds two of them equal.
 #include <algorithm>
 
 #include "kernels/machine_kernels.h"
@@ -11,7 +9,7 @@
 namespace vla::kernels {
 namespace {
 
-thread_local volatile float sink;  // what is stored here must be computed
+thread_local volatile float sink;  // stored so that the compiler must compute it
 
 /// Factors that keep every sum finite and normal: x <- 0.999 x + 0.001 tends to 1.
 constexpr float kFactor = 0.999f, kTerm = 0.001f;

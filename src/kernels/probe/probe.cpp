@@ -22,8 +22,8 @@ double seconds_between(Clock::time_point begin, Clock::time_point end) {
   return std::chrono::duration<double>(end - begin).count();
 }
 
-/// Runs `work(thread)` on all threads at once, again and again for about `seconds`, and returns the shortest time
-/// between the first thread's start and the last one's end.
+/// Runs `work(thread)` on all threads at once, repeatedly for about `seconds`. Returns the shortest time from the first
+/// thread's start to the last one's end.
 double shortest_burst(int n_thread, double seconds, const std::function<void(int)>& work) {
   struct Span {
     Clock::time_point begin, end;
@@ -33,7 +33,7 @@ double shortest_burst(int n_thread, double seconds, const std::function<void(int
   std::atomic<bool> again = true;
   double shortest = 0;
   const Clock::time_point start = Clock::now();
-  const auto judge = [&] {  // by thread 0, while the others wait
+  const auto judge = [&] {  // written by thread 0 while the others wait
     auto begin = spans[0].begin, end = spans[0].end;
     for (const Span& span : spans) begin = std::min(begin, span.begin), end = std::max(end, span.end);
     const double time = seconds_between(begin, end);
@@ -59,7 +59,7 @@ double shortest_burst(int n_thread, double seconds, const std::function<void(int
   return shortest;
 }
 
-/// Rounds that take about a millisecond: long beside a clock, short beside what interrupts a thread.
+/// Rounds of about a millisecond: long beside the clock's resolution, short beside interruptions.
 long rounds_of_a_burst(const PeakProbe& probe) {
   constexpr double kBurst = 1e-3;
   for (long n = 1024;; n *= 2) {
@@ -70,7 +70,7 @@ long rounds_of_a_burst(const PeakProbe& probe) {
   }
 }
 
-/// Memory that is given back at the end, in large pages where the system has them.
+/// Temporary memory, in huge pages if the system has them.
 class Memory {
  public:
   explicit Memory(std::size_t size) : size_(size) {
@@ -92,13 +92,13 @@ class Memory {
 };
 
 std::size_t beyond_caches() {
-  const long last_cache = ::sysconf(_SC_LEVEL3_CACHE_SIZE);  // 0 or less where the system does not say
+  const long last_cache = ::sysconf(_SC_LEVEL3_CACHE_SIZE);  // 0 or less if the system does not tell
   return std::clamp<std::size_t>(4 * static_cast<std::size_t>(std::max(0L, last_cache)), std::size_t{256} << 20,
                                  std::size_t{1} << 30);
 }
 
 std::uint64_t sum(const std::uint64_t* data, std::size_t count) {
-  std::uint64_t parts[8] = {};  // side by side, so that no addition waits for another
+  std::uint64_t parts[8] = {};  // independent sums, so that no addition waits for another
   for (std::size_t i = 0; i + 8 <= count; i += 8)
     for (std::size_t j = 0; j < 8; ++j) parts[j] += data[i + j];
   std::uint64_t all = 0;
@@ -121,7 +121,8 @@ double measure_read_bandwidth(int n_thread, double seconds) {
   if (memory.data() == nullptr) return 0;
   std::atomic<std::uint64_t> sink = 0;
   const auto part = [&](int thread) { return memory.data() + static_cast<std::size_t>(thread) * n_part; };
-  shortest_burst(n_thread, 0, [&](int thread) { std::fill_n(part(thread), n_part, 1); });  // each touches its own
+  // each thread faults in its own part
+  shortest_burst(n_thread, 0, [&](int thread) { std::fill_n(part(thread), n_part, 1); });
   const double time = shortest_burst(n_thread, seconds, [&](int thread) { sink += sum(part(thread), n_part); });
   return static_cast<double>(bytes) / time;
 }

@@ -11,32 +11,30 @@ namespace vla::kernels {
 
 enum class Number { f32, bf16, int8, ternary };
 
-/// A loop of multiply-adds on registers alone: as fast as the machine can multiply with these instructions.
+/// A loop of multiply-adds on registers: the peak rate of these instructions on this machine.
 struct PeakProbe {
   std::string name;  // "avx2 f32"
   Features needs;
-  Number number;        // what is multiplied; sums are f32, or int32 for int8 and ternary
-  double op_per_round;  // two for each multiply-add
+  Number number;        // operand type; sums are f32, or int32 for int8 and ternary
+  double op_per_round;  // operations per round, two per multiply-add
   void (*run)(long n_round);
 };
 
-/// Every loop that this machine can run, the slowest instructions first.
+/// All loops that this machine can run, slowest instructions first.
 const std::vector<PeakProbe>& peak_probes();
 
-/// The loop in whose rate the speed of these kernels is measured: that of the kernels' own products, and the fastest in
-/// float32 where they use no features, which is ggml.
+/// The loop that these kernels' speed is measured against: that of their own products, or the fastest in float32 for
+/// ggml, which uses no features of ours.
 const PeakProbe& peak_probe_of(Features use);
-/// The same of their products of int8 codes, by weights that are ternary or int8; null where these are made without
-/// such instructions.
+/// The same for their products of int8 codes with ternary or int8 weights; null if they have no such instructions.
 const PeakProbe* int8_probe_of(Features use, bool ternary);
 
-/// Operations per second of `n_thread` threads that run the loop side by side, in wall time. The best of many short
-/// bursts within about `seconds`: what the machine can do now, not what other programs leave of it.
+/// Operations per second (wall time) of `n_thread` threads that run the loop at once: the best of many short bursts
+/// within about `seconds`. This is what the machine can do, not what other programs leave of it.
 double measure_peak(const PeakProbe& probe, int n_thread, double seconds);
 
-/// Bytes per second that `n_thread` threads read side by side from a memory several times larger than the L3 cache,
-/// in wall time; the best of the passes within about `seconds`, of which the first pass takes as long as it needs.
-/// 0 where the system does not give the memory.
+/// Bytes per second (wall time) that `n_thread` threads read from memory several times larger than L3: the best pass
+/// within about `seconds`, and at least one whole pass. 0 if the memory cannot be allocated.
 double measure_read_bandwidth(int n_thread, double seconds);
 
 }  // namespace vla::kernels

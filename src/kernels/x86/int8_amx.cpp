@@ -10,7 +10,7 @@ namespace {
 struct AmxInt8Tile : AmxRounding {
   using Session = AmxSession;
   static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kStep = 768;
-  static constexpr int kBlockRows = 288;  // pi0's 560 rows are two blocks, and two threads read its weights together
+  static constexpr int kBlockRows = 288;  // pi0's 560 rows are two blocks, so two threads read its weights together
   static constexpr std::int64_t kBlockKiB = 640;
   static constexpr bool kEven = false, kBeside = true, kSigned = false;
   static constexpr RoundedLayout kLayout = RoundedLayout::tiles;
@@ -18,7 +18,7 @@ struct AmxInt8Tile : AmxRounding {
   template <class Packed, class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2, Packed>& strips,
                        std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
-    // Rows that x does not have are multiplied too; nobody looks at their sums.
+    // Rows after the last of x are multiplied too; their sums are not read.
     KeepVectorUnitPowered vectors;
     open(n_row, sums, add);
     for (std::int64_t k = 0; k < depth; k += kDepth) {
@@ -29,7 +29,7 @@ struct AmxInt8Tile : AmxRounding {
     close(n_row, sums);
   }
 
-  /// Multiplies by codes of less than a byte.
+  /// Multiplies by codes smaller than a byte.
   template <class Strips, class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
                        std::int32_t* sums, bool add, const Between& between) {
@@ -77,8 +77,8 @@ struct AmxInt8Tile : AmxRounding {
     _tile_loadd(3, sums + 16 * kColumns + 16, kLine);
   }
 
-  /// x streams past the L1 cache, where the panel stays. The first operand has a sign, the second has none: lines of
-  /// two strips, with their distances.
+  /// x bypasses L1, where the panel stays. The first operand is signed, the second unsigned: lines of two strips with
+  /// their strides.
   static VLA_INLINE void add_products(int n_row, const std::byte* x, std::int64_t x_stride, const std::byte* lines,
                                       std::size_t line, std::int64_t strip) {
     _tile_stream_loadd(4, x, static_cast<std::size_t>(x_stride));
@@ -99,7 +99,7 @@ struct AmxInt8Tile : AmxRounding {
       _tile_stored(2, sums + 16 * kColumns, kLine);
       _tile_stored(3, sums + 16 * kColumns + 16, kLine);
     }
-    before_tile_loads();  // nor do loads of the sums move before the stores
+    before_tile_loads();  // and loads of the sums do not move before the stores
   }
 };
 

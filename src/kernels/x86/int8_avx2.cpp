@@ -6,7 +6,7 @@
 namespace vla::kernels {
 namespace {
 
-/// The instruction of AVX-VNNI: sums of products of four bytes, one operand without sign.
+/// AVX-VNNI's vpdpbusd: four u8 x s8 products added to int32.
 struct FourProducts {
   static constexpr int kRows = 6, kStep = 512;
   static constexpr bool kSigned = false;
@@ -17,22 +17,23 @@ struct FourProducts {
   static VLA_INLINE __m256i total(__m256i sum) { return sum; }
 };
 
-/// Products of ternary weights: two of bytes summed to 16 bits, which hold 64 of such pairs: 2 * 2 * 127 each.
+/// Products of ternary weights: pairs of byte products are summed to 16 bits, which hold 64 such pairs of at most 2 * 2
+/// * 127 each.
 struct TwoProducts {
   static constexpr int kRows = 6, kStep = 256;
   static constexpr bool kSigned = false;
   static_assert(kStep / 4 * 2 * 2 * 127 <= 32767);
 
   static VLA_INLINE void add(__m256i& sum, __m256i numbers, __m256i codes) {
-    __m256i pairs;  // of the intrinsics compilers add pairs to each other first, and run out of registers
+    __m256i pairs;  // from intrinsics, compilers add pairs to each other first and run out of registers
     asm("vpmaddubsw %3, %2, %1\n\tvpaddw %1, %0, %0" : "+x"(sum), "=&x"(pairs) : "x"(numbers), "x"(codes));
   }
   static VLA_INLINE __m256i total(__m256i sum) { return _mm256_madd_epi16(sum, _mm256_set1_epi16(1)); }
 };
 
-/// Products of int8 weights: a pair of bytes up to 255 by codes would not fit into
-/// 16 bits. So the weight gives its sign to the code, which is never -128, and is at most 128 itself; pairs are then
-/// summed to 32 bits at once.
+/// Products of int8 weights: a pair of products of bytes up to 255 with codes does not fit into 16 bits. So the code
+/// takes the weight's sign (a code is never -128), and the weight becomes its magnitude, at most 128; pairs are widened
+/// to 32 bits at once.
 struct SignedProducts {
   static constexpr int kRows = 4, kStep = 512;
   static constexpr bool kSigned = true;
@@ -93,8 +94,8 @@ struct Avx2Tile {
   }
 };
 
-/// Products of int4 weights: two of codes summed to 16 bits, which hold a block less eight times what x sums to in it:
-/// 32 * 7 * 127. Its step multiplies that.
+/// Products of int4 weights: pairs of code products are summed to 16 bits, which hold a block's sum minus eight times
+/// the sum of x in it: 32 * 7 * 127. The block's step multiplies that.
 struct Int4Tile {
   using V = Avx2;
   static constexpr int kRows = 6, kColumns = 16, kBlockRows = 216, kStep = 1024, kBlock = Int4Block::kElements;
@@ -145,7 +146,7 @@ struct Int4Tile {
     }
   }
 
-  /// The amounts that codes for zero add to the two sums of a column, with the other sign.
+  /// Corrections for the two sums of a column, because code 8 stands for zero.
   static VLA_INLINE __m256i minus_zeros(const std::byte* x) {
     const __m256i zero = _mm256_set1_epi8(Int4Block::kZero);
     const auto* halves = reinterpret_cast<const __m256i*>(x);

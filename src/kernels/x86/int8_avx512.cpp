@@ -6,7 +6,7 @@
 namespace vla::kernels {
 namespace {
 
-/// 6 rows by 4 vectors: 24 sums. The instruction of AVX-512 VNNI sums products of four bytes, one operand without sign.
+/// 6 rows by 4 vectors: 24 sums. AVX-512 VNNI's vpdpbusd adds four u8 x s8 products to int32.
 template <int kDepth>
 struct VnniTile {
   using V = Avx512;
@@ -27,9 +27,9 @@ struct VnniTile {
   static constexpr int kStrips = kColumns / Int8Panels::kColumns;
 
   static VLA_INLINE void add_products(__m512i& sum, __m512i numbers, __m512i codes) {
-#ifdef VLA_EMULATED_INSTRUCTIONS  // in plain C++, for tests
+#ifdef VLA_EMULATED_INSTRUCTIONS  // in plain C++ for tests
     sum = _mm512_dpbusd_epi32(sum, numbers, codes);
-#else  // of the intrinsic compilers copy every sum
+#else  // from the intrinsic, compilers copy every sum
     asm("vpdpbusd %2, %1, %0" : "+v"(sum) : "v"(numbers), "v"(codes));
 #endif
   }

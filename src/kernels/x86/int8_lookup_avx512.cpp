@@ -20,12 +20,12 @@ using V = Avx512;
 constexpr std::int64_t kRows = 4, kColumns = 64, kStrips = kColumns / Int8Panels::kColumns;
 constexpr std::int64_t kRegister = 64;  // bytes
 
-/// A part of the depth, from k on: n_lookup times three elements that are looked up, then n_group times four that are
-/// multiplied. A tile looks up one and multiplies one at a time, and multiplies the groups that are left over alone.
+/// A part of the depth, starting at k: n_lookup times three elements that are looked up, then n_group times four that
+/// are multiplied. A tile alternates one lookup and one multiplication, then multiplies the remaining groups.
 struct Step {
   std::int64_t k, n_lookup, n_group;
 
-  /// In lines of 16 elements, of which three make 16 tables.
+  /// In lines of 16 elements; three lines make 16 tables.
   static constexpr std::int64_t kTableLines = 3, kLines = 14, kMaxLookup = 32, kMaxGroup = 4 * (2 * kLines - 1);
   static_assert(kMaxLookup * 2 * 3 * 127 <= 32767, "sums of 16 bits");
 
@@ -39,7 +39,7 @@ struct Step {
     return {line * Int8Panels::kGroup, n_table * Int8Panels::kGroup, 4 * (lines - kTableLines * n_table)};
   }
   std::int64_t depth() const { return 3 * n_lookup + 4 * n_group; }
-  /// The first of the elements that are multiplied.
+  /// The first element that is multiplied.
   std::int64_t multiplied() const { return k + 3 * n_lookup; }
 };
 
@@ -61,13 +61,13 @@ constexpr TableNumbers kTableNumbers;
 
 typedef std::uint32_t Words __attribute__((vector_size(kRegister)));
 
-/// The 16 tables of a row for codes k, 16 + k and 32 + k, kRows registers from one to the next.
+/// The 16 tables of a row for codes k, 16 + k and 32 + k, with a stride of kRows registers.
 VLA_INLINE void make_tables(const std::byte* x, std::byte* to) {
   const auto widened = [&](int from) VLA_LAMBDA {
     struct Codes {
       std::byte code[16];
     };
-    Words codes;  // the intrinsic makes gcc warn of its own header
+    Words codes;  // GCC warns about the intrinsic in its own header
     asm("vpmovzxbd %1, %0" : "=v"(codes) : "m"(*reinterpret_cast<const Codes*>(x + from)));
     return codes;
   };
@@ -85,12 +85,12 @@ VLA_INLINE void make_tables(const std::byte* x, std::byte* to) {
   }
 }
 
-/// Indices of a panel's columns into those tables: elements k of three lines of each strip. A register has those of two
-/// strips in turn, in the lowest five bits of 16; vpermw ignores the rest.
+/// Indices of a panel's columns into these tables: elements k of three lines of each strip. A register interleaves
+/// those of two strips, in the lowest five bits of 16; vpermw ignores the rest.
 VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::byte* to) {
   for (int pair = 0; pair < kStrips / 2; ++pair)
     for (int s = 0; s < 4; ++s) {
-      Words index[2];  // byte 4 n + i: of column n and element 4 s + i
+      Words index[2];  // byte 4 n + i: column n, element 4 s + i
       for (int j = 0; j < 2; ++j) {
         const auto numbers = [&](int line) VLA_LAMBDA {
           Words codes;
@@ -141,7 +141,7 @@ VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::b
   "vpermw %%zmm31, %%zmm30, %%zmm31\n"                                                      \
   "vpaddw %%zmm31, %%zmm" odd ", %%zmm" odd "\n"                                            \
   VLA_MULTIPLY(table, x, a, b, c, d, even, odd)
-/// Sums of 16 bits at even places to those of the first strip, at odd places to those of the second.
+/// Adds 16-bit sums at even places to those of the first strip, at odd places to those of the second.
 #define VLA_ADD_LOOKED_UP(table, x, a, b, c, d, even, odd)                                  \
   "vpdpwssd %%zmm24, %%zmm" even ", %%zmm" a "\n"                                           \
   "vpdpwssd %%zmm25, %%zmm" even ", %%zmm" b "\n"                                           \
@@ -149,8 +149,8 @@ VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::b
   "vpdpwssd %%zmm25, %%zmm" odd ", %%zmm" d "\n"
 // clang-format on
 
-/// sums [kColumns] x kRows += the products of a step. The whole tile in assembler: of the intrinsics compilers copy
-/// every sum, and it needs all registers.
+/// sums [kColumns] x kRows += the products of a step. The whole tile is assembly, because compilers copy every sum of
+/// intrinsics and the tile needs all registers.
 void tile(const std::byte* x, std::int64_t stride, const std::byte* numbers, const std::byte* indices,
           const std::byte* tables, const Step& step, std::int32_t* sums) {
   std::int64_t n_lookup = step.n_lookup, n_more = step.n_group - step.n_lookup;
@@ -199,13 +199,13 @@ void tile(const std::byte* x, std::int64_t stride, const std::byte* numbers, con
 #undef VLA_LOOK_UP_AND_MULTIPLY
 #undef VLA_ADD_LOOKED_UP
 
-/// Some panels by a block of rows, a step of the depth after the other. A step of all panels is expanded once for the
-/// block; tables are made of four rows at a time, which all panels share.
+/// An item: some panels by a block of rows, one step of the depth after the other. A step of all panels is expanded
+/// once for the block; tables are made for four rows at a time, and all panels share them.
 class LookupLoop {
   static constexpr std::int64_t kBlockRows = 108;
-  static constexpr std::int64_t kPanels = 20;                   // whose steps and sums lie in the L2 cache
-  static constexpr std::int64_t kManyPanels = 8;                // share the time of making tables
-  static constexpr std::int64_t kMinItems = 2, kManyItems = 8;  // for each thread, where there are so many
+  static constexpr std::int64_t kPanels = 20;                   // panels whose steps and sums fit into L2
+  static constexpr std::int64_t kManyPanels = 8;                // they share the cost of making tables
+  static constexpr std::int64_t kMinItems = 2, kManyItems = 8;  // per thread, if there are that many
 
   struct Tile {
     using V = kernels::V;
@@ -295,8 +295,8 @@ class LookupLoop {
     kernels::expand<V::Int, kStrips, Int8Panels::kGroup>(multiplied, 0, 4 * step.n_group, numbers.multiplied);
   }
 
-  /// A step of kRows rows from r on by n panels. Rows behind the block's are read (kMaxTernaryRows), and their sums
-  /// left.
+  /// Multiplies a step of kRows rows, starting at r, by n panels. Rows after the block's are read (kMaxTernaryRows),
+  /// and their sums ignored.
   void multiply(const Step& step, std::int64_t r, std::int64_t n) {
     for (std::int64_t i = 0; i < kRows; ++i)
       for (std::int64_t k = 0; k < step.n_lookup; k += 16) {
@@ -308,7 +308,7 @@ class LookupLoop {
            scratch_.tables, step, scratch_.sums[i] + r * kColumns);
   }
 
-  /// Writes the values that rows r to r + n of sums stand for.
+  /// Writes the values of rows r to r + n from their sums.
   void scale(const LinearJob::Part& part, const Stripe& s, const std::int32_t* sums, std::int64_t r, std::int64_t n,
              float* to) const {
     for (std::int64_t i = r; i < r + n; ++i, to += kColumns)
@@ -325,7 +325,7 @@ bool supports(const MatrixDesc& desc, Features use) {
   return desc.type == DType::ternary && use.has(Feature::permutes_beside_vnni);
 }
 
-constexpr std::int64_t kFewRows = 32;  // for which tables do not pay
+constexpr std::int64_t kFewRows = 32;  // fewer rows do not repay the tables
 
 }  // namespace
 

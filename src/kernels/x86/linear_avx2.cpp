@@ -7,14 +7,15 @@
 namespace vla::kernels {
 namespace {
 
-/// 6 rows by 2 vectors: twelve of the sixteen registers are sums, enough to hide the latency of two multiply-adds a
-/// cycle. What widens stored elements runs beside the multiply-adds.
+/// 6 rows by 2 vectors: twelve of the sixteen registers hold sums, enough to hide the latency of two multiply-adds per
+/// cycle. Widening of stored elements overlaps with the multiply-adds.
 struct Avx2Tile {
   using V = Avx2;
   using X = float;
   static constexpr int kRows = 6, kColumns = 16;
   static constexpr int kMaxDepth = 2048, kStep = 768, kBlockRows = 54;
-  static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
+  // not a multiple of a page, so that rows do not compete for the same cache lines
+  static constexpr int kXStride = kMaxDepth + 16;
   static constexpr bool kEven = true, kRounds = false;
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
@@ -32,7 +33,7 @@ struct Avx2Tile {
   }
 
  private:
-  // A cache line of a panel holds how many steps of the depth, and 8 columns of one of them as floats.
+  // Steps of the depth per cache line of a panel, and 8 columns of one step as floats.
   struct Pairs {
     static constexpr int kDepth = 2, kSize = 64;
     static VLA_INLINE __m256 load(const std::byte* line, int k, int half) {
@@ -61,12 +62,12 @@ struct Avx2Tile {
 #pragma GCC unroll 6
     for (int r = 0; r < kCount; ++r) left[r] = right[r] = _mm256_setzero_ps();
     for (const float* end = x + depth; x < end; ahead += 128) {
-      __builtin_prefetch(ahead, 0, 2);  // to the L2 cache
+      __builtin_prefetch(ahead, 0, 2);  // prefetch to L2
       __builtin_prefetch(ahead + 64, 0, 2);
       for (int i = 0; i < kPanelDepth; i += Line::kDepth, line += Line::kSize, x += Line::kDepth)
 #pragma GCC unroll 2
         for (int k = 0; k < Line::kDepth; ++k) {
-          asm("" : "+r"(line));  // a line of pairs is read again: kept in registers, it would push sums out
+          asm("" : "+r"(line));  // a line of pairs is loaded twice: keeping it in registers would spill sums
           const __m256 a = Line::load(line, k, 0), b = Line::load(line, k, 1);
 #pragma GCC unroll 6
           for (int r = 0; r < kCount; ++r) multiply_add(x[k + r * kXStride], a, b, left[r], right[r]);
@@ -80,8 +81,8 @@ struct Avx2Tile {
     }
   }
 
-  /// left += x * a, right += x * b. As instructions, since GCC moves sums from register to register otherwise, or
-  /// broadcasts early, and runs out of registers.
+  /// left += x * a, right += x * b. Written as assembly, because GCC otherwise moves sums between registers or
+  /// broadcasts early and runs out of registers.
   static VLA_INLINE void multiply_add(const float& x, __m256 a, __m256 b, __m256& left, __m256& right) {
     __m256 value;
     asm("vbroadcastss %3, %2\n\tvfmadd231ps %4, %2, %0\n\tvfmadd231ps %5, %2, %1"

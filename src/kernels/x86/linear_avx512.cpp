@@ -5,14 +5,15 @@
 namespace vla::kernels {
 namespace {
 
-/// 12 rows by 2 vectors: 24 sums. Elements of a panel are widened as they are loaded, so that a step of it takes half
-/// of the L1 cache and leaves the rest to x.
+/// 12 rows by 2 vectors: 24 sums. Elements of a panel are widened as they are loaded, so that a step takes half of L1
+/// and leaves the rest to x.
 struct Avx512Tile {
   using V = Avx512;
   using X = float;
   static constexpr int kRows = kAvx512Rows, kColumns = 32;
   static constexpr int kMaxDepth = 2048, kStep = 256, kBlockRows = 96;
-  static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
+  // not a multiple of a page, so that rows do not compete for the same cache lines
+  static constexpr int kXStride = kMaxDepth + 16;
   static constexpr bool kEven = true, kRounds = false;
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
@@ -31,15 +32,15 @@ struct Avx512Tile {
     static constexpr int kCount = 1, kXStride = Avx512Tile::kXStride;
     static VLA_INLINE __m512 everywhere(const float* x) { return _mm512_set1_ps(*x); }
     static VLA_INLINE void add(__m512& sum, __m512 value, __m512 numbers) {
-#ifdef VLA_EMULATED_INSTRUCTIONS  // in plain C++, for tests
+#ifdef VLA_EMULATED_INSTRUCTIONS  // in plain C++ for tests
       sum = _mm512_fmadd_ps(value, numbers, sum);
-#else  // of the intrinsic GCC 12 moves sums from register to register
+#else  // from the intrinsic, GCC 12 moves sums between registers
       asm("vfmadd231ps %2, %1, %0" : "+v"(sum) : "v"(value), "v"(numbers));
 #endif
     }
   };
-  // Element k of 16 columns, as floats. With masks of ones where an instruction without one would do: GCC 12 warns of
-  // undefined lanes in its own header.
+  // Element k of 16 columns as floats. It uses all-ones masks, because GCC 12 warns about undefined lanes in its own
+  // header for the unmasked form.
   struct Pairs : Number {
     static constexpr int kBlock = 32, kSize = 2;
     static VLA_INLINE __m512 load(const std::byte* p, int k) {

@@ -7,7 +7,7 @@
 namespace vla::kernels {
 namespace {
 
-/// 12 rows by 2 vectors: 24 sums. One instruction multiplies a pair of x by the pairs of 16 columns, as the panel has
+/// 12 rows by 2 vectors: 24 sums. One instruction multiplies a pair of x by the pairs of 16 columns, as panels store
 /// them.
 struct Avx512Bf16Tile {
   using V = Avx512;
@@ -51,7 +51,7 @@ struct Avx512Bf16Tile {
   };
 };
 
-/// Few rows are bound by reading weights: x stays as it is there.
+/// For few rows, where reading weights is the bottleneck; x stays float32.
 constexpr std::int64_t kMaxFew = 16;
 
 bool supports(const MatrixDesc& desc, Features use) {

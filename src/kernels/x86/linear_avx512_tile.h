@@ -11,17 +11,17 @@ namespace vla::kernels {
 
 constexpr int kAvx512Rows = 12;
 
-/// `Step` says what a step multiplies: X and kCount (elements of x), kXStride (from one row of x to the next), kBlock
-/// (the depth of a panel's block), kSize (bytes of an element in the panel), load(panel, i) (a vector of 16 columns for
-/// step i from `panel` on), everywhere(x) (one step of x for all columns), and add(sum, value, weights).
+/// `Step` describes a step: X and kCount (type and number of elements of x), kXStride (stride of rows of x), kBlock
+/// (depth of a panel's block), kSize (bytes of a panel element), load(panel, i) (16 columns for step i from `panel`),
+/// everywhere(x) (one step of x broadcast to all columns), and add(sum, value, weights).
 template <class Step, int kCount>
 void multiply_tile(const typename Step::X* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
                    const Prefetch& ahead) {
   constexpr int kSteps = 4, kDepth = kSteps * Step::kCount;
-  const std::int64_t n_line = ceil_div(ahead.size * kDepth, 64 * depth);  // of the cache, for each kDepth of the depth
+  const std::int64_t n_line = ceil_div(ahead.size * kDepth, 64 * depth);  // cache lines for each kDepth of the depth
   const std::byte* next = ahead.from;
   __m512 sum[kCount][2];
-#pragma GCC unroll 12  // or GCC keeps some of the sums in memory
+#pragma GCC unroll 12  // without it GCC keeps some of the sums in memory
   for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = _mm512_setzero_ps();
   for (std::int64_t block = 0; block < depth; block += Step::kBlock, panel += 2 * kPanelBlock)
     for (int i = 0; i < Step::kBlock; i += kDepth, x += kDepth) {
@@ -33,7 +33,7 @@ void multiply_tile(const typename Step::X* x, const std::byte* panel, std::int64
 #pragma GCC unroll 12
         for (int r = 0; r < kCount; ++r) {
           auto value = Step::everywhere(x + k * Step::kCount + r * Step::kXStride);
-          asm("" : "+v"(value));  // one load for both products
+          asm("" : "+v"(value));  // one load serves both products
           Step::add(sum[r][0], value, left);
           Step::add(sum[r][1], value, right);
         }

@@ -4,7 +4,7 @@
 
 namespace vla::kernels {
 
-// Each in the file of its name.
+// Each is defined in the file of its name.
 extern const LinearKernel kLinearAmx, kLinearAvx512Bf16, kLinearAvx512, kLinearAvx2;
 extern const LinearKernel kTernaryAmx, kTernaryLookup, kTernaryAvx512, kTernaryAvxVnni, kTernaryAvx2;
 extern const LinearKernel kInt4Amx, kInt4Avx512, kInt4AvxVnni, kInt4Avx2;

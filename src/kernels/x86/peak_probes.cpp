@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// Loops of multiply-adds on registers alone, one for each instruction set (probe/peak_probes.cpp). Each function names
-// the instructions that it is compiled for, and runs only where the machine has them.
+// Loops of multiply-adds on registers, one for each instruction set (probe/peak_probes.cpp). Each function is compiled
+// for the instructions it names and runs only on machines that have them.
 #include <immintrin.h>
 
 #include "kernels/machine_kernels.h"
@@ -10,7 +9,7 @@
 namespace vla::kernels {
 namespace {
 
-thread_local volatile float sink;  // what is stored here must be computed
+thread_local volatile float sink;  // stored so that the compiler must compute it
 
 /// Factors that keep every sum finite and normal: x <- 0.999 x + 0.001 tends to 1.
 constexpr float kFactor = 0.999f, kTerm = 0.001f;
@@ -37,7 +36,7 @@ constexpr float kFactor = 0.999f, kTerm = 0.001f;
   for (const __m512& s : sums) sink = _mm512_cvtss_f32(s);
 }
 
-/// The whole loop in assembler, `body` once for each of `sums`: of the intrinsics, compilers copy every sum, which
+/// The whole loop in assembly, with `body` once for each of `sums`: from intrinsics, compilers copy every sum, which
 /// halves the rate.
 // clang-format off
 #define VLA_SUM_LOOP(sums, body, ...)                                                       \
@@ -61,8 +60,8 @@ constexpr float kFactor = 0.999f, kTerm = 0.001f;
   VLA_SUM_LOOP(VLA_28_SUMS, "vdpbf16ps %%zmm30, %%zmm31, %%zmm\\sum\n", VLA_32_REGISTERS);
 }
 
-/// Sums of three elements that a permutation looks up, 32 of them, beside VNNI (int8_lookup_avx512.cpp): 96
-/// multiply-adds by each permutation and its addition, two products of 64 meanwhile.
+/// 32 sums of three elements looked up by a permutation, beside VNNI (int8_lookup_avx512.cpp): 96 multiply-adds for
+/// each permutation with its addition, and two products of 64 meanwhile.
 [[gnu::target("avx512f")]] void multiply_add_lookup(long n_round) {
   VLA_SUM_LOOP("0,1,2,3,4,5,6,7",
                "vpermw %%zmm30, %%zmm31, %%zmm29\n"
@@ -72,7 +71,7 @@ constexpr float kFactor = 0.999f, kTerm = 0.001f;
                VLA_32_REGISTERS);
 }
 
-/// Products of bytes in pairs, and their sums in 16 bits: two instructions for 32 multiply-adds.
+/// Pairs of byte products summed to 16 bits: two instructions for 32 multiply-adds.
 [[gnu::target("avx2")]] void multiply_add_bytes(long n_round) {
   VLA_SUM_LOOP(VLA_12_SUMS,
                "vpmaddubsw %%ymm14, %%ymm15, %%ymm13\n"
@@ -97,10 +96,11 @@ struct alignas(64) TileConfig {
   std::uint8_t n_row[16] = {16, 16, 16, 16, 16, 16, 16, 16};
 };
 
-constexpr TileConfig kTiles;  // constant memory: the intrinsic does not tell the compiler that it reads all of it
+// constant memory, because the intrinsic does not tell the compiler that it reads all of it
+constexpr TileConfig kTiles;
 
-/// Tiles 0 to 5 sum products of tiles 6 and 7, which are zero. With elements that differ the same loop has 86 % of this
-/// rate on Granite Rapids (docs/performance.md), so that no product reaches it.
+/// Tiles 0 to 5 sum products of tiles 6 and 7, which are zero. With different elements the loop runs at 86 % of this
+/// rate on Granite Rapids (docs/performance.md), which is the most that a product can reach.
 // clang-format off
 #define VLA_TILE_LOOP(multiply_add)                                                \
   _tile_loadconfig(&kTiles);                                                       \
@@ -121,7 +121,7 @@ constexpr TileConfig kTiles;  // constant memory: the intrinsic does not tell th
 }  // namespace
 
 std::span<const PeakProbe> machine::peak_probes() {
-  constexpr double kTileProduct = 16 * 16 * 32 * 2;  // of bf16; a tile holds twice as many int8
+  constexpr double kTileProduct = 16 * 16 * 32 * 2;  // for bf16; a tile holds twice as many int8
   static const PeakProbe all[] = {
       {"avx2 f32", {Feature::avx2}, Number::f32, 12 * 8 * 2, multiply_add_avx2},
       {"avx2 int8", {Feature::avx2}, Number::int8, 12 * 32 * 2, multiply_add_bytes},
