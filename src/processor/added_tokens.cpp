@@ -12,7 +12,7 @@ namespace vla {
 namespace {
 
 constexpr const char* kWhere = "tokenizer.added";
-constexpr std::size_t kMaxContent = 256;  // bytes; bounds the work per place of the text
+constexpr std::size_t kMaxContent = 256;  // bytes; limits the work at each position of the text
 
 Result<AddedToken> parse_added_token(const Json& item, std::string where, int n_vocab) {
   VLA_TRY(JsonFields fields, JsonFields::open(item, std::move(where)));
@@ -23,7 +23,7 @@ Result<AddedToken> parse_added_token(const Json& item, std::string where, int n_
   VLA_TRY(token.lstrip, fields.boolean("lstrip"));
   VLA_TRY(token.rstrip, fields.boolean("rstrip"));
   VLA_TRY(token.normalized, fields.boolean("normalized"));
-  VLA_CHECK(fields.boolean("special"));  // matters to decoding text only, which a policy never does
+  VLA_CHECK(fields.boolean("special"));  // affects decoding of text only, which policies do not do
   VLA_CHECK(fields.done());
   if (token.content.empty() || token.content.size() > kMaxContent)
     return fields.wrong("content", "1 to " + std::to_string(kMaxContent) + " bytes");
@@ -38,7 +38,7 @@ bool stands_alone(std::string_view before, std::string_view after) {
   return left && right;
 }
 
-/// Bytes of white space at the end of `text`.
+/// Length of the white space at the end of `text`, in bytes.
 std::size_t trailing_space(std::string_view text) {
   std::size_t size = 0;
   while (size < text.size()) {
@@ -132,7 +132,7 @@ void AddedTokens::split(std::string_view text, const std::function<void(std::str
 
 void AddedTokens::split(const Trie& trie, std::string_view text, const std::function<void(std::string_view)>& on_text,
                         const std::function<void(std::int32_t)>& on_token) const {
-  std::size_t done = 0;  // bytes already given to a callback
+  std::size_t done = 0;  // bytes already passed to a callback
   for (std::size_t at = 0; at < text.size();) {
     const Match match = longest_at(trie, text.substr(at));
     if (match.token < 0) {
@@ -142,9 +142,9 @@ void AddedTokens::split(const Trie& trie, std::string_view text, const std::func
     const AddedToken& token = tokens_[static_cast<std::size_t>(match.token)];
     std::size_t start = at;
     std::size_t stop = at + match.size;
-    at = stop;  // a rejected match is passed over as a whole, as the reference's search does
+    at = stop;  // skips the whole rejected match, as the reference's search does
     if (token.single_word && !stands_alone(text.substr(0, start), text.substr(stop))) continue;
-    // White space that the token before has already taken stays with it.
+    // White space that the previous token took stays with that token.
     if (token.lstrip && start > done) start -= trailing_space(text.substr(done, start - done));
     if (token.rstrip) stop = std::max(stop, done), stop += leading_space(text.substr(stop));
     if (start > done) on_text(text.substr(done, start - done));

@@ -13,35 +13,35 @@
 
 namespace vla {
 
-/// The id of an added token that the embedding has no row for: text that holds it cannot be encoded.
+/// The id of an added token without a row in the embedding. Text that contains it cannot be encoded.
 inline constexpr std::int32_t kNoRow = -1;
 
-/// A token that is cut out of the text before anything else looks at it, e.g. `<image>`.
+/// A token that is cut out of the text before normalization and splitting, e.g. `<image>`.
 struct AddedToken {
-  std::int32_t id = 0;  // kNoRow: it has no row in the embedding
+  std::int32_t id = 0;  // kNoRow: no row in the embedding
   std::string content;
-  bool single_word = false;  // only where no word character stands next to it
-  bool lstrip = false;       // takes the white space on its left with it
-  bool rstrip = false;       // ... on its right
-  bool normalized = false;   // looked for after all others, in what they left
+  bool single_word = false;  // only between characters that are not word characters
+  bool lstrip = false;       // includes the white space on its left
+  bool rstrip = false;       // includes the white space on its right
+  bool normalized = false;   // searched for after all others, in normalized text
 };
 
-/// Reads `tokenizer.added`. Errors: bad_bundle, also for ids at or beyond `n_vocab`, repeated ids or contents.
+/// Reads `tokenizer.added`. Errors: bad_bundle, also for ids from `n_vocab` on, and for repeated ids or contents.
 Result<std::vector<AddedToken>> parse_added_tokens(const std::string& json, int n_vocab);
 
-/// Finds added tokens in text: leftmost, and the longest of those that start there.
-/// Source: tokenizers added_vocabulary.rs (extract_and_normalize, find_matches).
+/// Finds added tokens in text: leftmost first, the longest of those that start at one place. Source: tokenizers
+/// added_vocabulary.rs (extract_and_normalize, find_matches).
 class AddedTokens {
  public:
-  /// Normalizes text, and the contents of `normalized` tokens, before those are looked for.
+  /// Normalizes text and the contents of `normalized` tokens before those are searched for.
   using Normalize = std::string (*)(std::string_view);
 
   AddedTokens() = default;
-  /// `normalize` may be null: text stays as it is.
+  /// `normalize` may be null: then text stays as it is.
   explicit AddedTokens(std::vector<AddedToken> tokens, Normalize normalize = nullptr);
 
-  /// Calls `on_text` for each piece between added tokens, normalized and never empty, and `on_token` for the id of each
-  /// token, in text order.
+  /// Calls `on_text` for each non-empty, normalized piece between added tokens and `on_token` for each token's id, in
+  /// text order.
   void split(std::string_view text, const std::function<void(std::string_view)>& on_text,
              const std::function<void(std::int32_t)>& on_token) const;
 

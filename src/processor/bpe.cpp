@@ -14,7 +14,7 @@ bool is_printable(int byte) {
   return (byte >= '!' && byte <= '~') || (byte >= 0xA1 && byte <= 0xAC) || (byte >= 0xAE && byte <= 0xFF);
 }
 
-/// Printable Latin-1 bytes are their own symbols; the other 68 follow from U+0100 on, in order.
+/// Printable Latin-1 bytes are their own symbols; the other 68 bytes are U+0100 and following, in order.
 std::array<std::uint32_t, 256> make_symbols() {
   std::array<std::uint32_t, 256> symbols{};
   std::uint32_t next = 0x100;
@@ -23,7 +23,7 @@ std::array<std::uint32_t, 256> make_symbols() {
   return symbols;
 }
 
-/// The bytes that a token's text encodes, or nothing when the text is not of the alphabet.
+/// The bytes that a token's text encodes; none if a character is not in the alphabet.
 std::optional<std::string> bytes_of(std::string_view text) {
   std::string bytes;
   while (!text.empty()) {
@@ -64,7 +64,7 @@ Result<Bpe> Bpe::create(const std::vector<std::string>& tokens, const std::vecto
   VLA_TRY(bpe.merges_, Merges::create(ids, merges));
   if (!ignore_merges) return bpe;
   for (std::size_t i = 0; i < tokens.size(); ++i) {
-    // An added token is found before words are formed, so its text is never a word by itself.
+    // An added token is cut out before words are formed, so its text is never a word.
     if (is_added[i]) continue;
     if (auto bytes = bytes_of(tokens[i])) bpe.whole_words_.emplace(std::move(*bytes), static_cast<std::int32_t>(i));
   }

@@ -14,21 +14,20 @@
 
 namespace vla {
 
-/// The byte that a character of the byte-level alphabet encodes (U+0100 is byte 0, `Ġ` is the blank, printable ASCII
-/// is itself); -1 for every other character.
+/// The byte that a character of the byte-level alphabet encodes (U+0100 is byte 0, `Ġ` is a space, printable ASCII is
+/// itself); -1 for other characters.
 int byte_of_symbol(std::uint32_t code_point);
 
-/// Byte-level byte-pair encoding of one word: its symbols are bytes.
-/// Source: tokenizers models/bpe/model.rs.
+/// Byte-level byte-pair encoding of one word, whose symbols are bytes. Source: tokenizers models/bpe/model.rs.
 class Bpe {
  public:
   /// `tokens` by id, `merges` as `left right` by rank, both in the byte-level alphabet. With `ignore_merges` a word
-  /// that is a token as a whole becomes it at once, unless the token `is_added` (by id). Errors: bad_bundle when a byte
-  /// has no token, two ids share a text, or a merge names what is not a token.
+  /// that is a whole token becomes that token, unless the token `is_added` (by id). Errors: bad_bundle if a byte has no
+  /// token, two ids share a text, or a merge names an unknown token.
   static Result<Bpe> create(const std::vector<std::string>& tokens, const std::vector<std::string>& merges,
                             bool ignore_merges, const std::vector<bool>& is_added);
 
-  /// Appends the ids of one word, given as raw bytes. Time grows as n log n with the length of the word.
+  /// Appends the ids of one word, given as raw bytes. Takes O(n log n) for n bytes.
   void encode(std::string_view word, std::vector<std::int32_t>& ids) const;
 
  private:

@@ -14,19 +14,19 @@
 
 namespace vla {
 
-/// Byte-pair encoding as SentencePiece made popular: the symbols are characters, blanks are written as U+2581 and join
-/// words with their neighbours, and a character that is no token becomes the tokens `<0x00>` to `<0xFF>` of its bytes.
-/// Source: tokenizers models/bpe/model.rs (merge_word, byte_fallback).
+/// SentencePiece-style byte-pair encoding. Symbols are characters; spaces are written as U+2581 and join words; a
+/// character without a token becomes the tokens `<0x00>` to `<0xFF>` of its bytes. Source: tokenizers
+/// models/bpe/model.rs (merge_word, byte_fallback).
 class ByteFallbackBpe {
  public:
-  /// `tokens` by id, `merges` as `left right` by rank. Errors: bad_bundle when a byte has neither its own token nor,
-  /// as Gemma's tab, its character as one; when two ids share a text, or a merge names what is not a token.
+  /// `tokens` by id, `merges` as `left right` by rank. Errors: bad_bundle if a byte has neither its own token nor (like
+  /// Gemma's tab) a token of its character, two ids share a text, or a merge names an unknown token.
   static Result<ByteFallbackBpe> create(const std::vector<std::string>& tokens, const std::vector<std::string>& merges);
 
-  /// `text` with every blank written as U+2581.
+  /// `text` with every space written as U+2581.
   static std::string mark_blanks(std::string_view text);
 
-  /// Appends the ids of valid UTF-8 whose blanks are marked. The whole piece is one word.
+  /// Appends the ids of valid UTF-8 with marked spaces. The whole piece is one word.
   void encode(std::string_view piece, std::vector<std::int32_t>& ids) const;
 
  private:

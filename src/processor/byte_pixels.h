@@ -19,7 +19,7 @@ inline const std::array<float, 256>& byte_table() {
   return table;
 }
 
-/// Interleaved bytes as planes of bytes / 255.
+/// Converts interleaved bytes to planes of bytes / 255.
 inline void spread_bytes(std::span<const std::uint8_t> rgb, std::span<float> out) {
   const auto& table = byte_table();
   const std::size_t size = rgb.size() / 3;
@@ -27,7 +27,7 @@ inline void spread_bytes(std::span<const std::uint8_t> rgb, std::span<float> out
     for (std::size_t c = 0; c < 3; ++c) out[c * size + i] = table[rgb[3 * i + c]];
 }
 
-/// 255 x of pixels in [0, 1], without rounding. A byte that was divided by 255 comes back.
+/// Pixels in [0, 1] times 255, without rounding; recovers bytes that were divided by 255.
 inline std::vector<std::uint8_t> cut_to_bytes(std::span<const float> pixels) {
   std::vector<std::uint8_t> bytes;
   bytes.reserve(pixels.size());

@@ -9,13 +9,13 @@
 
 namespace vla {
 
-/// Every `step`-th code point from `first` to `last` has its small letter `distance` away.
+/// A range of capitals: every `step`-th code point from `first` to `last`; the small letter is `distance` away.
 struct Capitals {
   std::uint32_t first, last, step;
   std::int32_t distance;
 };
 
-/// The small letter of a code point by a table in order, or the code point itself.
+/// The small letter of a code point by a sorted table, or the code point itself.
 inline std::uint32_t small_letter(std::span<const Capitals> table, std::uint32_t c) {
   const auto after = std::upper_bound(table.begin(), table.end(), c, [](std::uint32_t code_point, const Capitals& run) {
     return code_point < run.first;

@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// Names of actions that come out the same, within 1e-5, whatever a network of this chunk says: their statistics have
+/// Names of actions that never change by more than 1e-5, whatever the network computes, because their statistics have
 /// no spread.
 std::vector<std::string> constant_actions(const Processor& processor, int horizon, int d_action);
 

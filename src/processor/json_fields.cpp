@@ -11,7 +11,7 @@ namespace vla {
 namespace {
 
 constexpr int kMaxDepth = 16;
-constexpr std::size_t kShown = 60;  // characters of a wrong value in a message
+constexpr std::size_t kShown = 60;  // characters of a wrong value that a message shows
 
 std::string shown(const Json& value) {
   const std::string text = value.dump(-1, ' ', true, Json::error_handler_t::replace);
@@ -58,7 +58,7 @@ Result<const Json*> JsonFields::field(const std::string& name, const char* expec
 
 bool JsonFields::is_integer(const Json& value, int low, int high) {
   if (!value.is_number_integer()) return false;
-  // An unsigned number beyond int64 would wrap when read as one.
+  // An unsigned number above int64's range would wrap if read as signed.
   if (value.is_number_unsigned() && value.get<std::uint64_t>() > static_cast<std::uint64_t>(INT64_MAX)) return false;
   return value.get<std::int64_t>() >= low && value.get<std::int64_t>() <= high;
 }

@@ -14,14 +14,14 @@ namespace vla {
 
 using Json = nlohmann::json;
 
-/// Parses a JSON document held by a bundle. What a bundle holds nests three deep; a document that nests without end, on
-/// which the library's recursive functions would exhaust the stack, is refused. Errors: bad_bundle at `where`.
+/// Parses a JSON document of a bundle. Documents that nest too deep are refused, because the library's recursion would
+/// exhaust the stack; real ones nest three deep. Errors: bad_bundle at `where`.
 Result<Json> parse_json(const std::string& text, const std::string& where);
 /// The same for a document that must be a list.
 Result<Json> parse_json_list(const std::string& text, const std::string& where);
 
-/// One JSON object of a bundle whose fields are all required and all known: each is read by name and type, and `done`
-/// refuses fields that were not read. Errors: bad_bundle at `where.field`.
+/// Reads one JSON object whose fields are all required and known: each is read by name and type, and `done` refuses
+/// fields that were not read. Errors: bad_bundle at `where.field`.
 class JsonFields {
  public:
   static Result<JsonFields> open(const Json& object, std::string where);
@@ -35,13 +35,13 @@ class JsonFields {
   /// A number in `range`, as float32 or in double precision.
   Result<float> number(const std::string& name, Range range);
   Result<double> wide_number(const std::string& name, Range range);
-  /// A list of integers in [low, high], none of them twice.
+  /// A list of distinct integers in [low, high].
   Result<std::vector<int>> integers(const std::string& name, int low, int high);
   /// A list of `count` elements in `range`.
   Result<std::vector<float>> numbers(const std::string& name, std::size_t count, Range range);
   Result<bool> boolean(const std::string& name);
   Result<std::string> string(const std::string& name);
-  /// One of the spellings; the result is its index.
+  /// The index of the value among these spellings.
   Result<int> choice(const std::string& name, const std::vector<const char*>& spellings);
 
   Status done() const;
@@ -57,7 +57,7 @@ class JsonFields {
   std::set<std::string> read_;
 };
 
-/// The error for an op that stands where it may not.
+/// The error for an op at a place where it is not allowed.
 inline Error misplaced(const JsonFields& fields, const char* expected) { return fields.wrong("op", expected); }
 
 }  // namespace vla

@@ -9,7 +9,7 @@
 namespace vla {
 namespace {
 
-/// A part of the word while it is merged: a linked list in an array.
+/// A part of the word during merging: a node of a linked list in an array.
 struct Symbol {
   std::int32_t id;
   int prev, next;  // -1 at the ends
@@ -69,7 +69,7 @@ Result<Merges> Merges::create(const TokenIds& ids, const std::vector<std::string
   Merges table;
   table.rows_.assign(ids.size() + 1, 0);
   for (std::size_t i = 0; i < rows.size(); ++i) {
-    // Of two merges of the same pair the later one counts, as in the reference.
+    // If a pair is merged twice in the list, the later entry counts, as in the reference.
     const bool again =
         i + 1 < rows.size() && rows[i + 1].left == rows[i].left && rows[i + 1].merge.right == rows[i].merge.right;
     if (again) continue;
@@ -109,7 +109,7 @@ void Merges::apply(const std::vector<std::int32_t>& word, std::vector<std::int32
     Symbol& left = at(top.left);
     if (left.merged_away || left.next < 0) continue;
     Symbol& right = at(left.next);
-    // The pair may have changed since it was queued. Like the reference, what counts is the token it becomes now.
+    // The pair may have changed since it was queued. As in the reference, the token that it becomes now counts.
     const Merge* merge = find(left.id, right.id);
     if (merge == nullptr || merge->id != top.id) continue;
     right.merged_away = true;

@@ -12,9 +12,9 @@
 namespace vla {
 namespace {
 
-constexpr int kMaxParts = 4;  // code points that one decomposes to at most
+constexpr int kMaxParts = 4;  // most code points that one code point decomposes to
 
-/// Bytes at the start whose characters take part in normalization, or take no part in it, as `wanted` says.
+/// Length of the prefix whose characters take part in normalization (or do not, by `wanted`), in bytes.
 std::size_t run(std::string_view text, bool wanted) {
   std::size_t size = 0;
   while (size < text.size()) {
@@ -41,8 +41,8 @@ Characters decomposed(std::string_view text) {
   return characters;
 }
 
-/// The canonical order: marks between two characters that are none, by their class. The library's own sorting takes
-/// quadratic time, seconds for an instruction of nothing but marks.
+/// Canonical ordering: sorts marks between starters by their combining class. The library's own sort takes quadratic
+/// time: seconds for an instruction of marks only.
 void put_in_order(Characters& characters) {
   const auto mark_class = [](utf8proc_int32_t c) { return utf8proc_get_property(c)->combining_class; };
   const auto is_mark = [&](utf8proc_int32_t c) { return mark_class(c) != 0; };
@@ -60,7 +60,7 @@ void compose(Characters& characters) {
   characters.resize(static_cast<std::size_t>(count));
 }
 
-/// No function of the library fails here: the text is UTF-8, the buffer is large enough, and nothing else is taken.
+/// No library function can fail here: the text is valid UTF-8 and the buffer is large enough.
 void append_normal(std::string_view text, bool composed, std::string& out) {
   Characters characters = decomposed(text);
   put_in_order(characters);
@@ -72,7 +72,7 @@ std::string normal(std::string_view text, bool composed) {
   std::string out;
   out.reserve(text.size());
   while (!text.empty()) {
-    // A character that takes no part is a wall: nothing composes with it or moves past it.
+    // A character that does not take part blocks composition and reordering across it.
     std::size_t size = run(text, false);
     out.append(text.substr(0, size));
     text.remove_prefix(size);

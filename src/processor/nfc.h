@@ -7,11 +7,11 @@
 
 namespace vla {
 
-/// Valid UTF-8 in Unicode's normalization form C: a letter followed by its accent becomes one character where there is
-/// one, and marks come in a fixed order. Equal to the NFC of the Hugging Face `tokenizers` library on every string.
-/// That library's tables are older than any system's: characters that they do not know stay as and where they are.
+/// Normalizes valid UTF-8 to Unicode's form C (NFC): a letter and its accent become one character where one exists, and
+/// marks get a fixed order. Equal to the NFC of the Hugging Face `tokenizers` library on every string. Its tables are
+/// older than any system's; characters that they do not know stay unchanged.
 std::string nfc(std::string_view text);
-/// The same in normalization form D: every letter apart from its accents, Korean syllables in their parts.
+/// The same in form D (NFD): letters are separated from accents, Korean syllables into parts.
 std::string nfd(std::string_view text);
 
 }  // namespace vla

@@ -11,20 +11,20 @@ namespace {
 
 constexpr std::size_t kChannels = 3;
 
-/// The ops behind the fit, which work on each element of a plane for itself.
+/// Applies the ops after the fit, which change each element of a plane separately.
 void apply_ops(const Recipe& recipe, int view, std::span<float> planes) {
   for (const auto& op : recipe.image)
     if (op->view() == PlaneOp::kEveryView || op->view() == view) op->apply(planes);
 }
 
-/// Of each channel what the ops make of black, then of white.
+/// What the ops make of black, then of white, per channel.
 std::array<float, 2 * kChannels> ends_of(const Recipe& recipe, int view) {
   std::array<float, 2 * kChannels> ends = {0, 1, 0, 1, 0, 1};
   apply_ops(recipe, view, ends);
   return ends;
 }
 
-/// Black where both ends are the same, or no number is left.
+/// Black if both ends are equal or not finite.
 std::uint8_t byte_of(float x, float black, float white) {
   const float share = (x - black) / (white - black);
   return static_cast<std::uint8_t>(share > 0 ? std::lround(255 * std::min(share, 1.0f)) : 0);

@@ -6,9 +6,8 @@
 
 namespace vla {
 
-/// What the network gets of a frame of this view of `views()`, as a picture of 8 bits for people: the planes that
-/// `Processor::encode_images` makes of it, whose numbers are scaled so that what the recipe makes of black is black,
-/// and what it makes of white is white. Errors: bad_observation.
+/// The planes that `Processor::encode_images` makes of a frame of this view, as an 8-bit picture for people. Values are
+/// scaled so that the recipe's results for black and white are black and white. Errors: bad_observation.
 Result<Frame> picture_of(const Processor& processor, const Frame& frame, int view);
 
 }  // namespace vla

@@ -14,12 +14,12 @@ constexpr const char* kWhere = "tokenizer.pre";
 constexpr std::size_t kMaxSteps = 8;  // no real tokenizer has more than two
 constexpr std::uint8_t kLetterNumberSpace = unicode::kLetter | unicode::kNumber | unicode::kSpace;
 
-/// The one of the expression's classes that a character is in; 0 is `[^\s\p{L}\p{N}]`.
+/// The expression's class of a character; 0 is `[^\s\p{L}\p{N}]`.
 std::uint8_t kind(std::uint32_t code_point) {
   return static_cast<std::uint8_t>(unicode::classes(code_point) & kLetterNumberSpace);
 }
 
-/// Bytes of the longest run of one kind at the start.
+/// Length of the longest prefix of one class, in bytes.
 std::size_t run(std::string_view text, std::uint8_t wanted) {
   std::size_t size = 0;
   while (size < text.size()) {
@@ -30,7 +30,7 @@ std::size_t run(std::string_view text, std::uint8_t wanted) {
   return size;
 }
 
-/// Bytes of the longest run of numbers at the start, `most` of them at most.
+/// Length of the longest prefix of at most `most` numbers, in bytes.
 std::size_t numbers(std::string_view text, int most) {
   std::size_t size = 0;
   for (int i = 0; i < most && size < text.size(); ++i) {
@@ -49,7 +49,7 @@ std::size_t contraction(std::string_view text) {
   return 0;
 }
 
-/// The same in either case. To the reference's expressions the long s, U+017F, is a lower-case s as well.
+/// The same for either case. The reference's expressions treat the long s, U+017F, as a lower-case s.
 std::size_t contraction_of_any_case(std::string_view text) {
   constexpr std::string_view kLongS = "'\u017F";
   if (text.starts_with(kLongS)) return kLongS.size();
@@ -69,10 +69,10 @@ void split_words(std::size_t (*word)(std::string_view), std::string_view text, c
   }
 }
 
-/// Into numbers and what is between them; `individual`: into single digits.
+/// Splits into numbers and the text between them; `individual`: into single digits.
 void split_digits(bool individual, std::string_view text, const OnPiece& on_piece) {
   std::size_t start = 0;
-  bool numeric = false;  // of the piece that begins at `start`
+  bool numeric = false;  // class of the piece that begins at `start`
   for (std::size_t at = 0; at < text.size();) {
     const unicode::Char c = unicode::first(text.substr(at));
     const bool digit = (unicode::classes(c.code_point) & unicode::kDigit) != 0;
@@ -86,7 +86,7 @@ void split_digits(bool individual, std::string_view text, const OnPiece& on_piec
   if (start < text.size()) on_piece(text.substr(start));
 }
 
-/// `\s+(?!\S)|\s+`, where there is white space: the last of it goes back to what follows, unless there is only one.
+/// `\s+(?!\S)|\s+`: of several white space characters before a word the last belongs to the word.
 std::size_t white_space(std::string_view text) {
   const std::size_t spaces = run(text, unicode::kSpace);
   if (spaces == text.size()) return spaces;
@@ -108,7 +108,7 @@ std::size_t gpt2_word(std::string_view text) {
 
 namespace {
 
-/// `n_digit`: the most numbers that are one word.
+/// `n_digit`: the most numbers in one word.
 std::size_t word_of(std::string_view text, int n_digit) {
   constexpr std::string_view kLineEnds = "\r\n";
   if (const std::size_t size = contraction_of_any_case(text)) return size;

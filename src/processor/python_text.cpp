@@ -11,8 +11,8 @@
 namespace vla::python {
 namespace {
 
-/// Bits of a run of code points. A cased character takes part in words of capitals and small letters; an ignorable
-/// one, as an apostrophe, does not end such a word.
+/// Flags of a run of code points. A cased character is part of a word of letters; an ignorable one, such as an
+/// apostrophe, does not end the word.
 enum Class : std::uint8_t { kAlnum = 1, kCased = 2, kIgnorable = 4 };
 
 struct Run {
@@ -36,7 +36,7 @@ std::uint8_t classes(std::uint32_t c) {
   return std::prev(after)->classes;  // the first run starts at 0
 }
 
-/// Whether the first character that is not ignorable is cased. `before`: of the end of the text, looking back.
+/// Whether the first character that is not ignorable is cased. `before`: searches backwards from the end.
 bool meets_cased(std::string_view text, bool before) {
   while (!text.empty()) {
     const unicode::Char c = before ? unicode::last(text) : unicode::first(text);

@@ -6,8 +6,8 @@
 #include <string>
 #include <string_view>
 
-/// Text as Python's str sees it. The tables were made by asking Python 3.11, of Unicode 14; characters that are newer
-/// are no letters to it.
+/// Text operations as Python's str defines them. The tables come from Python 3.11 with Unicode 14; newer characters are
+/// not letters.
 namespace vla::python {
 
 /// str.isspace(): bidirectional class WS, B or S, or category Zs.
@@ -16,11 +16,12 @@ bool is_space(std::uint32_t code_point);
 /// str.isalnum().
 bool is_alnum(std::uint32_t code_point);
 
-/// Valid UTF-8 by str.lower(): one capital dotted I becomes two characters, and a sigma that ends a word a final one.
+/// str.lower() for valid UTF-8: the dotted capital I becomes two characters, and a sigma at a word's end the final
+/// form.
 std::string lower(std::string_view text);
 
-/// Valid UTF-8 without what is neither alphanumeric nor white space nor an underscore, as
-/// re.sub(r"[^\w\s]", "", text) leaves it.
+/// Removes everything from valid UTF-8 that is neither alphanumeric nor white space nor an underscore, like
+/// re.sub(r"[^\w\s]", "", text).
 std::string drop_punctuation(std::string_view text);
 
 }  // namespace vla::python

@@ -66,7 +66,7 @@ Status parse_list(const Json& document, const char* name, Recipe& recipe) {
   return {};
 }
 
-/// Checks that one list uses what another makes: a discretized state without a place for it would be lost silently.
+/// Checks across lists: a discretized state without a place in the prompt would be lost silently.
 Status check_state(const Recipe& recipe) {
   if (recipe.discretizes_state == recipe.prompt_takes_state) return {};
   return Error{Code::bad_bundle, std::string(kWhere) + ".text",

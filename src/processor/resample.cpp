@@ -8,7 +8,7 @@
 namespace vla {
 namespace {
 
-/// The source positions that one output position sums, and their weights times 2^bits.
+/// The source positions that one output position sums, with weights times 2^bits.
 struct Window {
   int first;
   std::vector<int> weights;
@@ -31,7 +31,7 @@ int rounded_weight(double weight, int bits) {
   return static_cast<int>((weight < 0.0 ? -0.5 : 0.5) + weight * (1 << bits));
 }
 
-/// Fraction bits of weights: of 32 bits a pixel takes 8 and headroom 2. torch keeps weights in 16 bits.
+/// Fraction bits of weights: 32 bits minus 8 for a pixel and 2 of headroom. torch stores weights in 16 bits.
 int weight_bits(double largest, ByteFilter filter) {
   constexpr int kBits = 22;
   if (filter != ByteFilter::torch_bicubic) return kBits;
@@ -43,7 +43,7 @@ int weight_bits(double largest, ByteFilter filter) {
 Windows make_windows(int n_in, int n_out, ByteFilter filter) {
   const bool wide = filter != ByteFilter::pillow_bilinear;
   const double scale = static_cast<double>(n_in) / n_out, widened = std::max(scale, 1.0);
-  const double support = (wide ? 2.0 : 1.0) * widened;  // half the width of the filter
+  const double support = (wide ? 2.0 : 1.0) * widened;  // half of the filter's width
   std::vector<std::vector<double>> exact;
   Windows windows{0, {}};
   double largest = 0.0;
@@ -71,7 +71,8 @@ Windows make_windows(int n_in, int n_out, ByteFilter filter) {
   return windows;
 }
 
-/// `n_line` lines of positions `step` bytes apart, lines `line_step` apart; three channels at each position.
+/// Resamples `n_line` lines. Positions are `step` bytes apart, lines `line_step` apart, with three channels at each
+/// position.
 struct Layout {
   int n_line;
   std::size_t step, line_step;
@@ -95,7 +96,7 @@ void resample_axis(const std::uint8_t* in, Layout from, std::uint8_t* out, Layou
   }
 }
 
-/// Interleaved bytes and their size.
+/// An image of interleaved bytes.
 struct Pixels {
   int width, height;
   std::vector<std::uint8_t> rgb;
@@ -123,8 +124,8 @@ Pixels with_height(Pixels from, int height, ByteFilter filter) {
   return to;
 }
 
-/// Pillow 13.0 saves work this way, which changes bytes, since the first sums are rounded; releases before it and torch
-/// sum rows first always.
+/// Pillow 13.0 reorders the passes to save work, which changes bytes because the first sums are rounded. Earlier
+/// releases and torch always sum rows first.
 bool columns_come_first(int width, int height, int to_width, int to_height, ByteFilter filter) {
   return filter != ByteFilter::torch_bicubic && height - to_height > 2 * std::max(width - to_width, 0);
 }

@@ -8,8 +8,8 @@
 
 namespace vla {
 
-/// How bytes are resized in integers, by a filter that widens when an image shrinks (antialiasing): a triangle or
-/// Keys' cubic with a = -0.5, with weights of 22 binary digits, or of as many as 16 bits hold.
+/// Integer resampling of bytes with a filter that widens when an image shrinks (antialiasing): a triangle or Keys'
+/// cubic with a = -0.5. Weights have 22 binary digits, or as many as 16 bits hold.
 enum class ByteFilter { pillow_bilinear, pillow_bicubic, torch_bicubic };
 
 /// An RGB image of interleaved bytes at another size, equal to the bit to Pillow 13.0's or to torchvision's resize of

@@ -10,14 +10,14 @@ namespace {
 
 constexpr float kOne = 2048.0f;  // a weight of 1
 
-/// One output position along one axis: two source positions and their weights.
+/// One output position along one axis: two source positions with weights.
 struct Tap {
   int low, high;
   int low_weight, high_weight;
 };
 
-/// `columns`: a position beyond the edge takes the edge alone. Rows there are blended with themselves, which loses a
-/// digit now and then.
+/// `columns`: a position outside of the image takes the edge pixel only. Rows blend the edge row with itself, which
+/// sometimes changes the last digit.
 std::vector<Tap> make_taps(int n_in, int n_out, bool columns) {
   const double scale = 1.0 / (static_cast<double>(n_out) / n_in);
   std::vector<Tap> taps;
@@ -34,8 +34,7 @@ std::vector<Tap> make_taps(int n_in, int n_out, bool columns) {
   return taps;
 }
 
-/// The same for INTER_AREA where an image grows: an output position that lies inside one source position takes it
-/// alone.
+/// The same for INTER_AREA when an image grows: an output position inside one source position takes it alone.
 std::vector<Tap> make_area_taps(int n_in, int n_out) {
   const double inverse = static_cast<double>(n_out) / n_in, scale = 1.0 / inverse;
   std::vector<Tap> taps;
@@ -51,7 +50,7 @@ std::vector<Tap> make_area_taps(int n_in, int n_out) {
   return taps;
 }
 
-/// One row of the image at its new width; values are 2048 times as large as bytes.
+/// Resizes one row; values are bytes times 2048.
 void widen(const std::uint8_t* row, const std::vector<Tap>& columns, int* out) {
   for (const Tap& tap : columns)
     for (int c = 0; c < 3; ++c)
@@ -80,7 +79,7 @@ std::vector<std::uint8_t> blend(std::span<const std::uint8_t> rgb, int width, co
   const std::size_t in_row = static_cast<std::size_t>(width) * 3, out_row = columns.size() * 3;
   std::vector<std::uint8_t> out(out_row * rows.size());
   std::vector<int> wide[2] = {std::vector<int>(out_row), std::vector<int>(out_row)};
-  int held[2] = {-1, -1};  // the source rows that `wide` holds, each under the parity of its number
+  int held[2] = {-1, -1};  // the source rows in `wide`, each at the parity of its index
   const auto row_of = [&](int y) {
     const std::size_t slot = static_cast<std::size_t>(y) % 2;
     if (held[slot] != y) widen(rgb.data() + static_cast<std::size_t>(y) * in_row, columns, wide[slot].data());
@@ -119,14 +118,14 @@ std::vector<std::uint8_t> pooled(std::span<const std::uint8_t> rgb, int width, i
   return out;
 }
 
-/// A source position that lies, wholly or in part, in an output position.
+/// A source position that lies partly or wholly in an output position.
 struct Share {
   int to, from;
   float weight;
 };
 
 std::vector<Share> make_cells(int n_in, int n_out) {
-  constexpr double kLeast = 1e-3;  // of a source position, below which it does not count
+  constexpr double kLeast = 1e-3;  // smallest share of a source position that counts
   const double scale = 1.0 / (static_cast<double>(n_out) / n_in);
   std::vector<Share> cells;
   for (int i = 0; i < n_out; ++i) {
@@ -141,7 +140,7 @@ std::vector<Share> make_cells(int n_in, int n_out) {
   return cells;
 }
 
-/// Cells that cut through pixels: sums of float32, first along rows, then along columns.
+/// Output cells that cut through pixels: float32 sums, first along rows, then along columns.
 std::vector<std::uint8_t> averaged(std::span<const std::uint8_t> rgb, int width, const std::vector<Share>& columns,
                                    const std::vector<Share>& rows) {
   const auto in_row = static_cast<std::size_t>(width) * 3;

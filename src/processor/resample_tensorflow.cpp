@@ -18,7 +18,7 @@ float lanczos3(float x) {
   return kRadius * std::sin(kPi * x) * std::sin(kPi * x / kRadius) / (kPi * kPi * x * x);
 }
 
-/// The source positions that one output position sums, and their weights.
+/// The source positions that one output position sums, with weights.
 struct Window {
   int first;
   std::vector<float> weights;
@@ -47,7 +47,7 @@ std::vector<Window> make_windows(int n_in, int n_out) {
   return windows;
 }
 
-/// `line` adds up: source position, weight.
+/// Sums a line: calls `line` with each source position and weight.
 template <class Line>
 void each_weight(const Window& window, Line line) {
   for (std::size_t k = 0; k < window.weights.size(); ++k)
@@ -56,10 +56,10 @@ void each_weight(const Window& window, Line line) {
 
 std::uint8_t rounded(float x) { return static_cast<std::uint8_t>(std::clamp(std::nearbyint(x), 0.0f, 255.0f)); }
 
-/// A pixel between two of a line, in corners' coordinates.
+/// A position between two pixels of a line; corners map to corners.
 struct Place {
   std::size_t low, high;
-  float share;  // of the higher one
+  float share;  // weight of the upper pixel
 };
 
 std::vector<Place> make_places(int n_in, int n_out, float begin, float end) {

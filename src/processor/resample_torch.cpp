@@ -16,7 +16,7 @@ float triangle(float distance) {
   return x < 1.0f ? 1.0f - x : 0.0f;
 }
 
-/// Keys' cubic with a = -0.5, as the compiler fuses it there.
+/// Keys' cubic with a = -0.5, with the multiply-adds that torch's compiler fuses.
 float cubic(float distance) {
   const float x = std::abs(distance);
   if (x < 1.0f) return std::fma(std::fma(1.5f, x, -2.5f) * x, x, 1.0f);
@@ -24,20 +24,20 @@ float cubic(float distance) {
   return 0.0f;
 }
 
-/// The source positions that one output position sums, and their weights.
+/// The source positions that one output position sums, with weights.
 struct Window {
   int first;
   std::vector<float> weights;
 };
 
-/// A filter and half its width.
+/// A filter and half of its width.
 struct Filter {
   float (*weight)(float distance);
   double support;
 };
 constexpr Filter kCubic = {cubic, 2.0}, kTriangle = {triangle, 1.0};
 
-/// float and double are mixed as the reference mixes them.
+/// Mixes float and double as the reference does.
 std::vector<Window> make_windows(int n_in, int n_out, const Filter& filter) {
   const float scale = static_cast<float>(n_in) / static_cast<float>(n_out);
   const double wide_scale = static_cast<double>(scale);
@@ -63,7 +63,7 @@ std::vector<Window> make_windows(int n_in, int n_out, const Filter& filter) {
   return windows;
 }
 
-/// `x * weight` added to each element of a row.
+/// Adds `x * weight` to each element of a row.
 inline __attribute__((always_inline)) void add_row(std::span<const float> x, float weight, bool fused, float* sums) {
   if (fused) {
     for (std::size_t k = 0; k < x.size(); ++k) sums[k] = std::fma(x[k], weight, sums[k]);
@@ -75,8 +75,8 @@ inline __attribute__((always_inline)) void add_row(std::span<const float> x, flo
   }
 }
 
-/// One row out of several. After the first product the reference's compiler multiplies four at once and adds them one
-/// by one; the remaining products are fused.
+/// Sums several rows into one. torch's compiler computes the first product alone, then four products at once which it
+/// adds one by one; the remaining products are fused.
 inline __attribute__((always_inline)) void sum_of_rows(std::span<const float> in, const Window& window,
                                                        std::span<float> out) {
   const std::size_t n_plain = (window.weights.size() - 1) / 4 * 4;
@@ -87,7 +87,7 @@ inline __attribute__((always_inline)) void sum_of_rows(std::span<const float> in
   }
 }
 
-// As for the letterbox: without the instruction std::fma is a slow but equal library function.
+// As in the letterbox: std::fma is equal on all machines, and slow without the instruction.
 #if defined(__x86_64__)
 __attribute__((target("fma"))) void sum_of_rows_fused(std::span<const float> in, const Window& window,
                                                       std::span<float> out) {
@@ -102,7 +102,7 @@ void sum_rows(std::span<const float> in, const Window& window, std::span<float> 
   sum_of_rows(in, window, out);
 }
 
-/// Rows and columns of pixels exchanged.
+/// Transposes pixels.
 void turn(std::span<const float> rgb, std::size_t width, float* out) {
   const std::size_t height = rgb.size() / 3 / width;
   for (std::size_t y = 0; y < height; ++y)
@@ -110,15 +110,15 @@ void turn(std::span<const float> rgb, std::size_t width, float* out) {
       for (std::size_t c = 0; c < 3; ++c) out[(x * height + y) * 3 + c] = rgb[(y * width + x) * 3 + c];
 }
 
-/// The image at its new width. A band of rows is turned, so that one loop over whole rows serves columns as well; it
-/// is a narrow one that stays in the cache.
+/// Resizes the width. It transposes a band of rows, so that one loop over whole rows also serves columns; the band is
+/// narrow enough for the cache.
 std::vector<float> widened(std::span<const float> rgb, std::size_t width, std::size_t to_width, const Filter& filter) {
   constexpr std::size_t kBand = 16;
   const std::vector<Window> windows = make_windows(static_cast<int>(width), static_cast<int>(to_width), filter);
   const std::size_t height = rgb.size() / 3 / width;
   std::vector<float> out(to_width * height * 3), columns(width * kBand * 3), sums(to_width * kBand * 3);
   for (std::size_t top = 0; top < height; top += kBand) {
-    const std::size_t size = 3 * std::min(kBand, height - top);  // of a column of the band
+    const std::size_t size = 3 * std::min(kBand, height - top);  // length of a column in the band
     const std::span<float> column_in(columns.data(), size * width), column_out(sums.data(), size * to_width);
     turn(rgb.subspan(3 * top * width, size * width), width, column_in.data());
     for (std::size_t x = 0; x < to_width; ++x) sum_rows(column_in, windows[x], column_out.subspan(x * size, size));
@@ -127,13 +127,14 @@ std::vector<float> widened(std::span<const float> rgb, std::size_t width, std::s
   return out;
 }
 
-/// Half to even: adding 2^23 to a number in [0, 255] rounds off its fraction. The library's function is a slow call.
+/// Rounds half to even: adding 2^23 to a value in [0, 255] rounds off its fraction. The library function would be a
+/// slow call.
 std::uint8_t rounded(float x) {
   constexpr float kNoFraction = 0x1p23f;
   return static_cast<std::uint8_t>(std::clamp(x, 0.0f, 255.0f) + kNoFraction - kNoFraction);
 }
 
-/// Columns first. `finish` makes a pixel's value of a sum.
+/// Sums columns first. `finish` converts a sum to a pixel's value.
 template <class Finish>
 auto resample(std::vector<float> pixels, int width, int height, int to_width, int to_height, const Filter& filter,
               Finish finish) {

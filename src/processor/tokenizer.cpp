@@ -14,7 +14,7 @@
 namespace vla {
 namespace {
 
-constexpr std::size_t kMaxAround = 8;  // no real tokenizer puts more than two ids in front of a text or behind it
+constexpr std::size_t kMaxAround = 8;  // no real tokenizer adds more than two ids before or after a text
 
 /// In the order of `kKinds`.
 enum class Kind { byte_level, byte_fallback, wordpiece };
@@ -28,14 +28,14 @@ Result<Kind> read_kind(const Keys& keys) {
                "this bundle needs a newer vla"};
 }
 
-/// Ids that stand in front of every text or behind it.
+/// Reads the ids before or after every text.
 Result<std::vector<std::int32_t>> read_around(const Keys& keys, const char* key, std::size_t n_token) {
   VLA_TRY(std::vector<std::int32_t> ids, keys.integers(key, {0, static_cast<double>(n_token) - 1.0}));
   if (ids.size() <= kMaxAround) return ids;
   return Error{Code::bad_bundle, key, "at most " + std::to_string(kMaxAround) + " ids", std::to_string(ids.size())};
 }
 
-/// By id, whether it is that of an added token.
+/// For each id whether it is an added token's.
 std::vector<bool> are_added(const std::vector<AddedToken>& added, std::size_t n_token) {
   std::vector<bool> is_added(n_token);
   for (const AddedToken& token : added)
@@ -43,9 +43,8 @@ std::vector<bool> are_added(const std::vector<AddedToken>& added, std::size_t n_
   return is_added;
 }
 
-/// The text of an added token is in the list of tokens too, so that the list is complete.
-/// `whole_words`: a single word token that is passed over could come back as a word of the model, and the bundle does
-/// not say whether the model's own vocabulary has it.
+/// Adds the texts of added tokens to the list of tokens, so that it is complete. `whole_words`: a skipped single-word
+/// token could come back as a word of the model, and the bundle does not say whether the model's vocabulary has it.
 Status check_added(const std::vector<AddedToken>& added, const std::vector<std::string>& tokens, bool whole_words) {
   for (std::size_t i = 0; i < added.size(); ++i) {
     const std::string where = "tokenizer.added[" + std::to_string(i) + "]";
@@ -60,7 +59,7 @@ Status check_added(const std::vector<AddedToken>& added, const std::vector<std::
   return {};
 }
 
-/// Reads how text between the added tokens is normalized.
+/// Reads how text between added tokens is normalized.
 Status read_normalization(const Keys& keys, Kind kind, AddedTokens::Normalize& normalize) {
   constexpr const char* kKey = "tokenizer.normalization";
   normalize = kind == Kind::byte_fallback ? ByteFallbackBpe::mark_blanks : nullptr;
@@ -122,7 +121,7 @@ Status Tokenizer::read_byte_fallback(const Keys& keys, const std::vector<std::st
   return {};
 }
 
-/// A word is a token as a whole, or may be: an added one that is passed over must not come back as such.
+/// With this kind a whole word may become a token, so a skipped added token must not come back as one.
 Status Tokenizer::read_wordpiece(const Keys& keys, const std::vector<std::string>& tokens,
                                  const std::vector<AddedToken>& added) {
   VLA_CHECK(check_added(added, tokens, true));

@@ -18,25 +18,24 @@
 
 namespace vla {
 
-/// Text to token ids, equal to the Hugging Face `tokenizers` library (0.22) on every string. There are three kinds,
-/// byte-level BPE, BPE with byte fallback and WordPiece; the keys that describe them are in docs/bundle.md. Nothing is
-/// cut.
+/// Converts text to token ids, equal to the Hugging Face `tokenizers` library (0.22) on every string. Kinds: byte-level
+/// BPE, BPE with byte fallback, WordPiece; docs/bundle.md has their keys. It does not truncate.
 class Tokenizer {
  public:
-  /// Longest text, in bytes. An instruction is a sentence; what is longer is a mistake or an attack.
+  /// Longest text in bytes. An instruction is a sentence; a longer text is a mistake or an attack.
   static constexpr std::size_t kMaxText = 64 * 1024;
 
-  /// Reads and checks `tokenizer.*`; every id must be below `n_vocab`, the rows of the embedding. Errors: bad_bundle.
+  /// Reads and checks `tokenizer.*`; every id must be below `n_vocab`, the embedding's rows. Errors: bad_bundle.
   static Result<Tokenizer> create(const Keys& keys, int n_vocab);
 
-  /// Ids of `text`, which must be UTF-8 of at most `max_bytes` bytes, a prompt around an instruction being longer; NUL
-  /// is a character like any other. The ids of `prefix()` and `suffix()` stand around. Errors: bad_observation, also
-  /// for an added token that the embedding has no row for.
+  /// Encodes `text`, which must be UTF-8 of at most `max_bytes` bytes (a prompt is longer than its instruction); NUL is
+  /// an ordinary character. The result starts with `prefix()` and ends with `suffix()`. Errors: bad_observation, also
+  /// for an added token without a row in the embedding.
   Result<std::vector<std::int32_t>> encode(std::string_view text, std::size_t max_bytes = kMaxText) const;
 
-  /// The ids in front of every text (`<bos>`), where the tokenizer puts some.
+  /// The ids before every text (`<bos>`), or none.
   const std::vector<std::int32_t>& prefix() const { return prefix_; }
-  /// The ids behind every text (`[SEP]`).
+  /// The ids after every text (`[SEP]`), or none.
   const std::vector<std::int32_t>& suffix() const { return suffix_; }
 
  private:

@@ -9,46 +9,46 @@
 
 /// UTF-8 and character classes as the reference tokenizer sees them.
 ///
-/// The classes come from a table that was made by asking the reference about every code point. A system's own Unicode
-/// library is of another Unicode version on each system, and one more letter changes how a sentence splits into tokens;
-/// the same bundle and text must give the same ids everywhere.
+/// The classes come from a table made by asking the reference about every code point. A system's own Unicode library
+/// has another Unicode version on each system, and one more letter changes how a sentence splits into tokens; the same
+/// bundle and text must give the same ids everywhere.
 namespace vla::unicode {
 
 /// Bits of `classes`.
 enum Class : std::uint16_t {
-  kLetter = 1,         // \p{L} of the splitting expression
-  kNumber = 2,         // \p{N} of the splitting expression
-  kSpace = 4,          // \s of the splitting expression and of added tokens
-  kDigit = 8,          // what the digits step calls numeric; a few code points newer than kNumber
-  kWord = 16,          // \w of added tokens
-  kNormal = 32,        // takes part in the normalization NFC: composes, decomposes or is put in order
-  kControl = 64,       // what BERT's cleaning removes; the three that it keeps as blanks are not among them
+  kLetter = 1,         // \p{L} in the splitting expression
+  kNumber = 2,         // \p{N} in the splitting expression
+  kSpace = 4,          // \s in the splitting expression and for added tokens
+  kDigit = 8,          // numeric for the digits step; has a few code points that are newer than kNumber's
+  kWord = 16,          // \w for added tokens
+  kNormal = 32,        // takes part in NFC: composes, decomposes or is reordered
+  kControl = 64,       // removed by BERT's cleaning, except the three that it keeps as spaces
   kPunctuation = 128,  // a word of its own for BERT
   kMark = 256,         // an accent that BERT's normalization removes
 };
 
 std::uint16_t classes(std::uint32_t code_point);
 
-/// The small letter of a character as BERT's normalization makes it, or the character itself. U+0130, whose small
-/// letter is two characters, decomposes before it is asked for.
+/// BERT's small letter of a character, or the character itself. U+0130, whose small letter has two characters, is
+/// decomposed before.
 std::uint32_t lower(std::uint32_t code_point);
 
 struct Char {
   std::uint32_t code_point = 0;
-  std::size_t size = 0;  // bytes; 0 when the text is empty or not UTF-8 at this place
+  std::size_t size = 0;  // bytes; 0 if the text is empty or not UTF-8 here
 };
 
-/// The first character. Refuses, by size 0, what RFC 3629 does: overlong forms, surrogates, beyond U+10FFFF,
-/// truncation.
+/// Decodes the first character. Size 0 for what RFC 3629 refuses: overlong forms, surrogates, code points above
+/// U+10FFFF, truncation.
 Char first(std::string_view text);
 
-/// The last character of valid, non-empty UTF-8.
+/// Decodes the last character of valid, non-empty UTF-8.
 Char last(std::string_view text);
 
 /// Appends the UTF-8 of a code point.
 void append(std::string& out, std::uint32_t code_point);
 
-/// Bytes before the first place that is not UTF-8; `text.size()` when all of it is.
+/// Length of the longest prefix that is valid UTF-8, in bytes.
 std::size_t valid_prefix(std::string_view text);
 
 }  // namespace vla::unicode

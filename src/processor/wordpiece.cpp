@@ -17,7 +17,7 @@ struct Range {
   std::uint32_t first, last;
 };
 
-/// The ranges that the reference takes for Chinese; that of extension E begins 256 code points late.
+/// The reference's ranges of Chinese characters. Its range of extension E starts 256 code points late.
 constexpr Range kChinese[] = {{0x3400, 0x4DBF},   {0x4E00, 0x9FFF},   {0xF900, 0xFAFF},  {0x20000, 0x2A6DF},
                               {0x2A700, 0x2B81F}, {0x2B920, 0x2CEAF}, {0x2F800, 0x2FA1F}};
 
@@ -47,7 +47,7 @@ std::string cleaned(std::string_view text) {
   return out;
 }
 
-/// Bytes of the first `kMaxWord` characters.
+/// Length of the first `kMaxWord` characters, in bytes.
 std::size_t word_limit(std::string_view word) {
   std::size_t size = 0;
   for (std::size_t i = 0; i < kMaxWord && size < word.size(); ++i) size += unicode::first(word.substr(size)).size;
@@ -82,7 +82,7 @@ std::string WordPiece::normalize(std::string_view text) {
 }
 
 void WordPiece::encode(std::string_view text, std::vector<std::int32_t>& ids) const {
-  std::size_t start = 0, at = 0;  // of the word, and of what is read
+  std::size_t start = 0, at = 0;  // bytes of the word; bytes that are read
   const auto end_word = [&] {
     if (at > start) encode_word(text.substr(start, at - start), ids);
   };

@@ -12,17 +12,16 @@
 
 namespace vla {
 
-/// BERT's tokenizer for text without capitals and accents: words are cut into the longest tokens of a vocabulary from
-/// the left, of which those within a word begin with `##`. A word that cannot be cut is the unknown token as a whole,
-/// and so is one of more than 100 characters. Sources: tokenizers normalizers/bert.rs, pre_tokenizers/bert.rs,
-/// models/wordpiece/mod.rs.
+/// BERT's tokenizer for uncased text: words are split into the vocabulary's longest tokens from the left; tokens inside
+/// a word begin with `##`. A word that cannot be split, or has more than 100 characters, becomes the unknown token.
+/// Sources: tokenizers normalizers/bert.rs, pre_tokenizers/bert.rs, models/wordpiece/mod.rs.
 class WordPiece {
  public:
-  /// `tokens` by id; those of `is_added` are no words. Errors: bad_bundle when two ids share a text.
+  /// `tokens` by id; those that `is_added` are not words. Errors: bad_bundle if two ids share a text.
   static Result<WordPiece> create(const std::vector<std::string>& tokens, const std::vector<bool>& is_added,
                                   std::int32_t unknown);
 
-  /// Valid UTF-8 without control characters, accents and capitals; Chinese characters stand alone.
+  /// Removes control characters, accents and capitals from valid UTF-8, and separates Chinese characters.
   static std::string normalize(std::string_view text);
 
   /// Appends the ids of normalized text.
@@ -37,8 +36,8 @@ class WordPiece {
 
   void encode_word(std::string_view word, std::vector<std::int32_t>& ids) const;
 
-  Pieces heads_, tails_;     // tokens that begin a word, and what follows the marks of the others
-  std::size_t longest_ = 0;  // bytes of one of them
+  Pieces heads_, tails_;     // tokens that begin a word; the others, without their mark
+  std::size_t longest_ = 0;  // longest of them, in bytes
   std::int32_t unknown_ = 0;
 };
 

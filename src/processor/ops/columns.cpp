@@ -137,7 +137,7 @@ StateOp::Stage last_stage(const Recipe& recipe) {
   return recipe.state.empty() ? StateOp::Stage::convention : recipe.state.back()->stage();
 }
 
-/// A convention of a robot: some columns of its state.
+/// A robot's convention for some columns of its state.
 template <class Params>
 struct ColumnStateOp final : StateOp {
   Params params;
@@ -214,9 +214,9 @@ Status parse_action(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// Adds the state, as it is before its normalization, to the columns named. The sum is not rounded.
+/// Adds the state before its normalization to these columns. The sum is not rounded.
 struct AddStateOp final : ActionOp {
-  std::vector<int> columns, state_columns;  // where nothing says otherwise these are the same
+  std::vector<int> columns, state_columns;  // by default the same columns
   Status bind(ActionLayout& layout, const std::string& where) override {
     layout.relative = true;
     VLA_CHECK(check_columns(columns, static_cast<std::size_t>(layout.width), where));

@@ -15,7 +15,7 @@
 namespace vla {
 namespace {
 
-/// One output position along one axis: two source positions and their weights.
+/// One output position along one axis: two source positions with weights.
 struct Tap {
   int low, high;
   float low_weight, high_weight;
@@ -26,7 +26,7 @@ std::vector<Tap> make_taps(int n_in, int n_out) {
   std::vector<Tap> taps;
   taps.reserve(static_cast<std::size_t>(n_out));
   for (int i = 0; i < n_out; ++i) {
-    // torch fuses this product and difference; in double both are exact, so that one rounding remains here too.
+    // torch fuses this product and difference. Both are exact in double, so there is one rounding here too.
     const double exact = static_cast<double>(scale) * (static_cast<double>(i) + 0.5) - 0.5;
     const float source = std::max(static_cast<float>(exact), 0.0f);
     const int low = std::min(static_cast<int>(source), n_in - 1);
@@ -47,7 +47,7 @@ struct FloatSource {
   float operator()(std::size_t i) const { return values[i]; }
 };
 
-/// The destination of an image of `width` x `height` in planes of `plane` floats whose rows are `stride` apart.
+/// Where an image of `width` x `height` is written: planes of `plane` floats, with rows `stride` apart.
 struct Target {
   float* out;
   std::size_t plane, stride;
@@ -90,8 +90,8 @@ inline __attribute__((always_inline)) void resample(Source source, int source_wi
   }
 }
 
-// Without the instruction, std::fma is a slow but equal library function; with it, one instruction. Both machines get
-// the same pixels.
+// std::fma gives the same pixels on machines with and without the instruction; without it, it is a slow library
+// function.
 #if defined(__x86_64__)
 template <class Source>
 __attribute__((target("fma"))) void resample_fused(Source source, int source_width, const std::vector<Tap>& rows,
@@ -114,7 +114,7 @@ void place(Source source, int source_width, int source_height, const Target& to)
 
 namespace {
 
-/// The frame in 8 bits at the size of the target.
+/// The frame as 8-bit pixels at the target size.
 std::vector<std::uint8_t> resized_8bit(const Frame& frame, const Target& target) {
   const auto* given = std::get_if<std::vector<std::uint8_t>>(&frame.rgb);
   std::vector<std::uint8_t> bytes = given != nullptr ? *given : cut_to_bytes(std::get<std::vector<float>>(frame.rgb));
@@ -145,7 +145,7 @@ Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, 
     for (std::size_t c = 0; c < 3; ++c)
       std::fill_n(out.begin() + static_cast<std::ptrdiff_t>(c * target.plane), target.plane, to.fill[c]);
   }
-  const int share = to.align == Letterbox::Align::center ? 2 : 1;  // of the rest that lies at the left and at the top
+  const int share = to.align == Letterbox::Align::center ? 2 : 1;  // share of the padding at the left and top
   target.out += static_cast<std::size_t>((to.height - target.height) / share) * stride +
                 static_cast<std::size_t>((to.width - target.width) / share);
   if (to.antialias) {
@@ -164,7 +164,7 @@ void stretch(const Frame& frame, int width, int height, std::span<float> out) {
 
 namespace {
 
-/// One number for all channels, or one for each.
+/// One number for all channels, or one per channel.
 Result<std::array<float, 3>> read_fill(JsonFields& fields) {
   if (!fields.has_list("fill")) {
     VLA_TRY(const float all, fields.number("fill", {0, 1}));

@@ -11,15 +11,16 @@
 
 namespace vla {
 
-/// A frame of any size into `width` x `height`: aspect kept, the rest `fill`.
+/// Fits a frame of any size into `width` x `height`: keeps the aspect and fills the rest with `fill`.
 struct Letterbox {
   enum class Align { bottom_right, center };
 
   int width = 0;
   int height = 0;
-  std::array<float, 3> fill = {};     // of each channel
-  Align align = Align::bottom_right;  // where the image is; of an odd rest `center` leaves less at the left and top
-  bool antialias = false;             // as Pillow resamples 8-bit images, see below
+  std::array<float, 3> fill = {};  // per channel
+  // place of the image; with an odd rest `center` puts the smaller half at the left and top
+  Align align = Align::bottom_right;
+  bool antialias = false;  // resamples like Pillow on 8-bit images, see below
 };
 
 /// Writes (3, height, width) float32 to `out`; 8-bit values are divided by 255. A frame that has the size already is
@@ -36,7 +37,7 @@ struct Letterbox {
 /// Errors: bad_observation when a side of the resized image is shorter than a pixel.
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where);
 
-/// The same resampling to `width` x `height`, the aspect not kept.
+/// The same resampling to `width` x `height` without keeping the aspect.
 void stretch(const Frame& frame, int width, int height, std::span<float> out);
 
 }  // namespace vla

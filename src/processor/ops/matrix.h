@@ -11,7 +11,7 @@ namespace vla {
 template <class T>
 using Matrix3 = std::array<T, 9>;
 
-/// Each product and sum is rounded to T, from the first to the last.
+/// Each product and sum is rounded to T, in order.
 template <class T>
 Matrix3<T> product(const Matrix3<T>& a, const Matrix3<T>& b) {
   Matrix3<T> out{};

@@ -40,7 +40,7 @@ constexpr NormRule kRules[] = {
     {"groot_n1_5_mean_std", "mean", "std", Spread::value, Eps::kept, float32, true},
 };
 
-/// The spread in the precision of the rule.
+/// The spread in the rule's precision.
 template <class T>
 double spread_of(const NormRule& rule, bool divides, T low, T high, T eps) {
   const T spread = rule.spread == Spread::value ? high : high - low;
@@ -78,7 +78,7 @@ Normalizer::Normalizer(const NormRule& rule, Direction direction, double eps, st
 
 namespace {
 
-/// Statistics that no data have: nothing that a robot measures is so large, and no deviation is negative.
+/// Limits of plausible statistics: no robot measures values so large, and no deviation is negative.
 Status check_statistics(const NormRule& rule, std::span<const double> low, std::span<const double> high,
                         const std::string& stats) {
   const bool is_deviation = rule.spread == NormRule::Spread::value;
@@ -150,8 +150,8 @@ struct Fields {
   const NormRule* rule = nullptr;  // null: identity
   std::string stats;               // prefix of the statistics' tensor names
   double eps = 0.0;
-  std::string feature;  // full name of the state feature that it works on; empty: the whole vector
-  SomeColumns columns;  // of what it works on; the others pass
+  std::string feature;  // full name of its state feature; empty: the whole vector
+  SomeColumns columns;  // columns that it normalizes; the others pass unchanged
 
   bool reads(const std::string& tensor) const {
     return rule != nullptr &&
@@ -194,8 +194,8 @@ class NormalizeOp final : public StateOp {
 
  private:
   std::optional<Normalizer> normalizer_;  // none for identity
-  std::size_t offset_ = 0;                // column of the first statistic
-  std::vector<bool> chosen_;              // of each value whether it is normalized
+  std::size_t offset_ = 0;                // column of its first statistic
+  std::vector<bool> chosen_;              // for each value whether it is normalized
 };
 
 Status NormalizeOp::bind(StateLayout& layout, const std::string& where) {

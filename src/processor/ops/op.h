@@ -14,9 +14,9 @@
 #include "processor/image.h"
 #include "processor/names.h"
 
-/// The kinds of ops of a recipe. An op is read from its fields, checked against the bundle once, and applied to every
-/// observation or chunk. Each file of this folder holds an op, or a few that are closely related, and names them
-/// in a function `<file>_ops()`; the build puts these functions into one table (src/CMakeLists.txt).
+/// The interfaces of a recipe's ops. An op is parsed from its fields, checked against the bundle once, and applied to
+/// every observation or chunk. Each file of this folder has one op or a few related ones, and lists them in a function
+/// `<file>_ops()`; the build collects these functions in a table (src/CMakeLists.txt).
 namespace vla {
 
 class JsonFields;
@@ -27,7 +27,7 @@ struct Recipe;
 struct OpEntry {
   const char* list;  // image, text, state or action
   const char* name;
-  /// Reads the op and appends it to its list. Errors: bad_bundle, also for a place where the op has no meaning.
+  /// Parses the op and appends it to its list. Errors: bad_bundle, also if the op is not allowed there.
   Status (*parse)(JsonFields& fields, Recipe& recipe);
 };
 using Ops = std::vector<OpEntry>;
@@ -76,7 +76,7 @@ class PlaneOp {
   static constexpr int kEveryView = -1;
 
   virtual ~PlaneOp() = default;
-  /// Which view's planes it is for: an index into the bundle's views, or kEveryView.
+  /// The view that it applies to: an index into the bundle's views, or kEveryView.
   virtual int view() const { return kEveryView; }
   virtual void apply(std::span<float> planes) const = 0;
 };
@@ -84,7 +84,7 @@ class PlaneOp {
 class TextOp {
  public:
   virtual ~TextOp() = default;
-  /// `state`: the discretized state, where the prompt has a place for it. Errors: bad_observation.
+  /// `state`: the discretized state, for prompts that include it. Errors: bad_observation.
   virtual Result<std::string> apply(std::string text, std::span<const int> state) const = 0;
 };
 
@@ -92,27 +92,26 @@ class TextOp {
 struct StateLayout {
   const Bundle& bundle;
   const FeatureNames& features;
-  std::span<const int> dims;  // of each feature
+  std::span<const int> dims;  // widths of the features
   std::size_t n_state;        // values of all features together
-  std::size_t width;          // what the ops so far leave of them
-  std::size_t n_unmoved;      // the first values, which ops that widen a state leave at their places
+  std::size_t width;          // values after the ops so far
+  std::size_t n_unmoved;      // the leading values, whose places ops that widen a state keep
 };
 
 class StateOp {
  public:
-  /// The order in which the kinds of ops may follow each other; only the last op is of kind `end`.
+  /// The order in which kinds of ops may follow each other. Only the last op is of kind `end`.
   enum class Stage { convention, normalized, clipped, widened, end };
 
   virtual ~StateOp() = default;
   virtual Stage stage() const = 0;
-  /// Reads statistics, checks sizes, and changes the layout's width where the op does. `where` is the op's place in the
-  /// recipe. Errors: bad_bundle.
+  /// Reads statistics, checks sizes, and updates the layout's width. `where` is the op's place in the recipe. Errors:
+  /// bad_bundle.
   virtual Status bind(StateLayout&, const std::string& /*where*/) { return {}; }
   virtual void apply(std::span<float> /*state*/) const {}
-  /// Whether `apply` has normalized this value by statistics.
+  /// Whether `apply` normalizes this value by statistics.
   virtual bool normalizes(std::size_t /*column*/) const { return false; }
-  /// For kinds `widened` and `end`: makes the state that the network sees, and what goes into the prompt. Errors:
-  /// bad_observation.
+  /// For kinds `widened` and `end`: makes the network's state and the prompt's. Errors: bad_observation.
   virtual Status finish(std::vector<float>& /*state*/, std::vector<int>& /*discretized*/) const { return {}; }
   virtual bool reads(const std::string& /*tensor*/) const { return false; }
 };
@@ -127,32 +126,32 @@ struct ActionLayout {
   std::set<int> unnormalized = {};  // columns
 };
 
-/// A row's place in a chunk, and the state that it belongs to.
+/// A row's index in its chunk, and the observation's state.
 struct RowPlace {
   std::size_t index;                 // in the chunk
-  std::span<const float> raw_state;  // the state before its normalization
+  std::span<const float> raw_state;  // the state before normalization
 };
 
 class ActionOp {
  public:
   virtual ~ActionOp() = default;
-  /// Reads statistics, checks sizes, and changes the layout where the op does. Errors: bad_bundle.
+  /// Reads statistics, checks sizes, and updates the layout. Errors: bad_bundle.
   virtual Status bind(ActionLayout& layout, const std::string& where) = 0;
-  /// One row, in place. Its values are float32, but for those of an op that says otherwise; the last are rounded.
+  /// Changes one row in place. Values are float32, unless an op says otherwise; the final ones are rounded.
   virtual void apply(std::vector<double>& row, const RowPlace& place) const = 0;
-  /// Whether `apply` takes this column from the network's units by statistics.
+  /// Whether `apply` unnormalizes this column by statistics.
   virtual bool unnormalizes(std::size_t /*column*/) const { return false; }
   virtual bool reads(const std::string& /*tensor*/) const { return false; }
 };
 
-/// Largest image side and vector that a recipe may ask for: a damaged number must not ask for all memory.
+/// Largest image side and vector that a recipe may ask for, so that a damaged number cannot ask for all memory.
 inline constexpr int kMaxImageSide = 8192;
 inline constexpr int kMaxVector = 65536;
 inline constexpr int kMaxViews = 32;
-inline constexpr std::size_t kMaxOpText = 1 << 12;     // bytes of a text that an op looks for or writes
+inline constexpr std::size_t kMaxOpText = 1 << 12;     // bytes of a text that an op searches for or writes
 inline constexpr std::size_t kMaxViewsText = 1 << 20;  // bytes that a views op adds
 
-/// Values of pixels, states and actions: far beyond any of them, and far from the end of float32.
+/// Limits of pixels, states and actions: far above real values, far below float32's.
 inline constexpr Range kPlain = {-1e9, 1e9};
 
 inline Error misfit(std::string where, std::string expected, std::string found) {

@@ -9,23 +9,23 @@ namespace vla {
 
 /// `(x - mean) / std` of each channel of an image.
 struct Standardize {
-  /// float32; every value and result rounded to bfloat16; only the last result of float32; or float32 in bytes, where
-  /// x, mean and std are 255 times as large, so that the division by 255 rounds nothing.
+  /// Arithmetic: float32; every value and result rounded to bfloat16; only the last result rounded; or float32 in
+  /// bytes, where x, mean and std are 255 times as large, so that no division by 255 rounds.
   enum class Arithmetic { float32, bfloat16, float32_then_bfloat16, float32_in_bytes };
 
   std::array<float, 3> mean{}, std{};  // red, green, blue
   Arithmetic arithmetic = Arithmetic::float32;
 };
 
-/// In place, on planes (3, height, width). Source: lerobot policies/evo1/internvl3_embedder.py
-/// (_batched_pixel_values), torch's element-wise arithmetic; in bytes transformers image_processing_utils_fast.py
+/// In place, on planes (3, height, width). Source: lerobot policies/evo1/internvl3_embedder.py (_batched_pixel_values),
+/// torch's element-wise arithmetic; in bytes: transformers image_processing_utils_fast.py
 /// (_fuse_mean_std_and_rescale_factor).
 void standardize(std::span<float> pixels, const Standardize& op);
 
 /// `x * scale + shift`, each rounded to float32, in place.
 void affine(std::span<float> values, float scale, float shift);
 
-/// Holds every value in [low, high], in place. Interpolation can leave the range of its inputs by a rounding error.
+/// Clamps every value to [low, high], in place. Interpolation can leave its inputs' range by a rounding error.
 void clip(std::span<float> values, float low, float high);
 
 }  // namespace vla

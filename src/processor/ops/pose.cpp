@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// Poses of an end effector that are relative to the observed one.
-// Source: Isaac-GR00T gr00t/data/state_action/pose.py (EndEffectorPose) over scipy.spatial.transform.Rotation.
+// End-effector poses relative to the observed pose. Source: Isaac-GR00T gr00t/data/state_action/pose.py
+// (EndEffectorPose) over scipy.spatial.transform.Rotation.
 #include "processor/ops/pose.h"
 
 #include <fmt/format.h>
@@ -21,7 +20,7 @@ using Matrix = Matrix3<double>;
 
 Matrix transposed(const Matrix& m) { return {m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]}; }
 
-/// The rotation nearest to a matrix that is one up to rounding: Newton's steps, each of which squares the distance.
+/// The nearest rotation to a matrix that is one up to rounding, by Newton's method.
 Matrix nearest_rotation(Matrix m) {
   for (int step = 0; step < 2; ++step) {
     Matrix correction = product(transposed(m), m);
@@ -31,7 +30,7 @@ Matrix nearest_rotation(Matrix m) {
   return m;
 }
 
-/// As numpy has it: products are rounded to the elements' type, their sum is made in double precision.
+/// As in numpy: products are rounded to the element type, their sum is computed in double.
 template <class T>
 T dot(const T* a, const T* b) {
   const T x = a[0] * b[0], y = a[1] * b[1], z = a[2] * b[2];
@@ -59,7 +58,7 @@ Matrix rotation_of_rows(const T* rows) {
 
 Matrix rotation_of_vector(const double* v) {
   const double angle = std::sqrt(dot(v, v)), square = angle * angle;
-  // Of a small angle the quotient by its series.
+  // For small angles the quotient by its series.
   const double scale = angle <= 1e-3 ? 0.5 - square / 48 + square * square / 3840 : std::sin(angle / 2) / angle;
   const double x = scale * v[0], y = scale * v[1], z = scale * v[2], w = std::cos(angle / 2);
   return {w * w + x * x - y * y - z * z, 2 * (x * y - z * w),           2 * (x * z + y * w),
@@ -67,7 +66,7 @@ Matrix rotation_of_vector(const double* v) {
           2 * (x * z - y * w),           2 * (y * z + x * w),           w * w - x * x - y * y + z * z};
 }
 
-/// The quaternion is found by its largest part, which loses the fewest digits.
+/// Computes the quaternion from its largest component, which loses the fewest digits.
 void write_vector(const Matrix& m, double* out) {
   const std::array<double, 4> parts = {m[0], m[4], m[8], m[0] + m[4] + m[8]};
   const auto i = static_cast<std::size_t>(std::max_element(parts.begin(), parts.end()) - parts.begin());
@@ -126,7 +125,7 @@ Pose compose(const Pose& reference, const Pose& relative) {
 
 namespace {
 
-/// A pose that begins at `column` is relative to that of the state at `state_column`. The result is not rounded.
+/// A pose that starts at `column` is relative to the state's pose at `state_column`. The result is not rounded.
 struct ComposePoseOp final : ActionOp {
   PoseFormat format = PoseFormat::rotation_6d;
   int column = 0, state_column = 0;

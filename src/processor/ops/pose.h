@@ -8,26 +8,26 @@
 
 namespace vla {
 
-/// How a pose is written: its position, then its rotation.
+/// Formats of a pose: position, then rotation.
 enum class PoseFormat {
-  rotation_6d,      // the first two rows of the matrix, nine values in all
-  rotation_vector,  // axis times angle, six values in all
+  rotation_6d,      // first two rows of the matrix: nine values in all
+  rotation_vector,  // axis times angle: six values in all
 };
 std::size_t pose_size(PoseFormat format);
 
-/// A rigid motion: x becomes rotation x + position.
+/// A rigid motion: x -> rotation x + position.
 struct Pose {
   std::array<double, 3> position;
   std::array<double, 9> rotation;  // row by row
 };
 
-/// The rows of a 6D rotation are made orthogonal in the precision of their elements, then the nearest rotation is taken
-/// in double precision. Rows without a direction give values that are not finite.
+/// Orthogonalizes the rows of a 6D rotation in their own precision, then takes the nearest rotation in double. Rows
+/// without a direction give values that are not finite.
 Pose read_pose(PoseFormat format, std::span<const float> numbers);
 Pose read_pose(PoseFormat format, std::span<const double> numbers);
 void write_pose(PoseFormat format, const Pose& pose, std::span<double> numbers);
 
-/// `relative` as seen from where `reference` is.
+/// Transforms `relative` from the frame of `reference` to the world.
 Pose compose(const Pose& reference, const Pose& relative);
 
 }  // namespace vla

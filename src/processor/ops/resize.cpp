@@ -35,7 +35,7 @@ Status resize(const Frame& frame, const Resize& to, std::span<float> out, const 
 namespace {
 
 Result<Resize> read_resize(JsonFields& fields) {
-  constexpr int kMinSide = 2;  // torch reads the wrong rows for an image of one column
+  constexpr int kMinSide = 2;  // torch reads the wrong rows of an image with one column
   Resize op;
   VLA_TRY(op.width, fields.integer("width", kMinSide, kMaxImageSide));
   VLA_TRY(op.height, fields.integer("height", kMinSide, kMaxImageSide));
@@ -44,7 +44,7 @@ Result<Resize> read_resize(JsonFields& fields) {
   return op;
 }
 
-/// As the first op it makes the planes alone; further on it is one of several ops on bytes.
+/// As the first op it makes the planes; later in the list it is one of several ops on bytes.
 Status parse(JsonFields& fields, Recipe& recipe) {
   if (recipe.fit != nullptr) return parse_byte_resize(fields, recipe);
   VLA_TRY(const Resize op, read_resize(fields));

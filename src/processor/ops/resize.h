@@ -10,7 +10,7 @@
 
 namespace vla {
 
-/// A frame of any size to `width` x `height`, its aspect not kept, by the arithmetic of one reference.
+/// Resizes a frame to `width` x `height` without keeping its aspect, with one reference's arithmetic.
 struct Resize {
   enum class Filter { opencv_bilinear, torch_bicubic_8bit, torch_bilinear };
 

@@ -42,7 +42,7 @@ Status resize_floats(const Frame& frame, const FloatResizes& to, std::span<float
 
 namespace {
 
-constexpr int kMinSide = 2;  // torch reads the wrong rows for an image of one column
+constexpr int kMinSide = 2;  // torch reads the wrong rows of an image with one column
 constexpr std::size_t kMaxSizes = 4;
 
 struct FloatFit final : OneFit<FloatResizes> {
@@ -61,7 +61,7 @@ Result<FloatResize> read_size(JsonFields& fields) {
   return op;
 }
 
-/// Several in a row are one fit. The first may say of which cameras the frames are.
+/// Several in a row are one fit. The first may name the only frame size that is accepted.
 Status parse(JsonFields& fields, Recipe& recipe) {
   auto* fit = dynamic_cast<FloatFit*>(recipe.fit.get());
   if ((recipe.fit != nullptr && fit == nullptr) || !recipe.image.empty())

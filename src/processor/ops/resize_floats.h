@@ -13,7 +13,7 @@
 
 namespace vla {
 
-/// A size, without keeping the aspect, by `resample_torch_cubic` or `resample_torch_area`.
+/// One resize by `resample_torch_cubic` or `resample_torch_area`, without keeping the aspect.
 struct FloatResize {
   enum class Filter { bicubic, area };
 
@@ -22,16 +22,16 @@ struct FloatResize {
   Filter filter = Filter::bicubic;
 };
 
-/// Frames to one size after the other, in floats; the last is the network's.
+/// Resizes frames in floats to one size after the other; the last is the network's.
 struct FloatResizes {
-  std::optional<CameraSize> camera;  // the only frames that are taken, where their size decides that of the images
+  std::optional<CameraSize> camera;  // the only frame size accepted, if it determines the images' size
   std::vector<FloatResize> sizes;
 };
 
-/// Writes (3, height, width) float32 to `out`, bytes divided by 255 before anything else; bicubic edges may leave
-/// [0, 1]. An image that has a size already is not resampled. Source: lerobot policies/vla_jepa/modeling_vla_jepa.py
-/// (VLAJEPAModel.predict_action); transformers models/qwen2_vl/image_processing_qwen2_vl.py, of float tensors.
-/// Errors: bad_observation.
+/// Writes (3, height, width) float32 to `out`; bytes are divided by 255 first. Bicubic edges may leave [0, 1]. A step
+/// to the image's own size does nothing. Source: lerobot policies/vla_jepa/modeling_vla_jepa.py
+/// (VLAJEPAModel.predict_action); transformers models/qwen2_vl/image_processing_qwen2_vl.py, for float tensors. Errors:
+/// bad_observation.
 Status resize_floats(const Frame& frame, const FloatResizes& to, std::span<float> out, const std::string& where);
 
 }  // namespace vla

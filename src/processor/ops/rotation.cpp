@@ -1,11 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// A rotation in another representation: of a state as the network sees it, of an action as the robot takes it. Each
-// product and sum is rounded to float32 in the order of the reference. Its sines and angles come from torch, whose last
-// digits differ between machines; here they are the nearest float32 values.
-// Source: Isaac-GR00T (N1.5) gr00t/data/transform/state_action.py (RotationTransform) over pytorch3d 0.7.6
-// transforms/rotation_conversions.py.
+// Converts rotations between representations: a state's for the network, an action's for the robot. Each product and
+// sum is rounded to float32 in the reference's order. torch's sines and angles differ between machines in the last
+// digits; here they are the nearest float32 values. Source: Isaac-GR00T (N1.5) gr00t/data/transform/state_action.py
+// (RotationTransform) over pytorch3d 0.7.6 transforms/rotation_conversions.py.
 #include <fmt/format.h>
 
 #include <algorithm>
@@ -22,9 +20,9 @@ namespace {
 using Matrix = Matrix3<float>;
 using Axes = std::array<std::size_t, 3>;
 
-constexpr std::size_t kRows = 6;  // elements of the representation that is the first two rows of a matrix
+constexpr std::size_t kRows = 6;  // elements in the first two rows of a matrix
 
-/// The angles are of turns around these axes, roll (x), pitch (y) and yaw (z), the last of which is made first.
+/// Order of rotations around roll (x), pitch (y) and yaw (z); the last one is applied first.
 struct EulerOrder {
   const char* name;
   Axes axes;
@@ -39,7 +37,7 @@ float arc_tangent(float y, float x) {
   return static_cast<float>(std::atan2(static_cast<double>(y), static_cast<double>(x)));
 }
 
-/// q: the real part, then the three others; of any length.
+/// q: real part first, of any length.
 Matrix of_quaternion(const float* q) {
   const float r = q[0], i = q[1], j = q[2], k = q[3];
   const float s = 2.0f / (r * r + i * i + j * j + k * k);
@@ -48,7 +46,7 @@ Matrix of_quaternion(const float* q) {
           s * (i * k - j * r),     s * (j * k + i * r),     1 - s * (i * i + j * j)};
 }
 
-/// v: the axis times the angle.
+/// v: axis times angle.
 Matrix of_axis_angle(const float* v) {
   const float angle = std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), half = angle * 0.5f;
   const float scale = angle < 1e-6f ? 0.5f - angle * angle / 48 : sine(half) / angle;
@@ -71,8 +69,8 @@ Matrix of_euler_angles(const Axes& axes, const float* angles) {
   return product(first, around(axes[2], angles[2]));
 }
 
-/// The angle around one of two axes from the elements of the matrix that are its sine and cosine times something.
-/// `line`: the row, of the last axis, or the column, of the first axis, that holds them.
+/// The angle around the first or last axis, from the matrix elements that hold its sine and cosine times a common
+/// factor. `line`: the row (last axis) or column (first axis) with these elements.
 float outer_angle(std::size_t axis, std::size_t middle, const std::array<float, 3>& line, bool is_row) {
   std::size_t i = (axis + 2) % 3, k = (axis + 1) % 3;
   if (is_row) std::swap(i, k);
@@ -80,7 +78,7 @@ float outer_angle(std::size_t axis, std::size_t middle, const std::array<float, 
   return is_row == even ? arc_tangent(line[i], line[k]) : arc_tangent(-line[k], line[i]);
 }
 
-/// Writes three angles; the middle one is NaN where rounding makes its sine larger than 1, as in the reference.
+/// Writes three angles. The middle one is NaN if rounding makes its sine larger than 1, as in the reference.
 void write_euler_angles(const Axes& axes, const Matrix& m, std::span<double> out) {
   const auto [first, middle, last] = axes;
   const bool even = (first + 1) % 3 == middle;
@@ -94,9 +92,9 @@ void write_euler_angles(const Axes& axes, const Matrix& m, std::span<double> out
 
 /// Replaces a rotation in the state by the first two rows of its matrix.
 struct RotationStateOp final : StateOp {
-  int from = 0;  // 0: quaternion, 1: axis and angle, from 2 on an order of Euler angles
+  int from = 0;  // 0: quaternion, 1: axis and angle, from 2 on: an order of Euler angles
   int column = 0;
-  bool scales = false;  // from [-1, 1] to [-1, 1], in which values lose digits
+  bool scales = false;  // from [-1, 1] to [-1, 1], which loses digits as in the reference
 
   Stage stage() const override { return Stage::widened; }
   Status bind(StateLayout& layout, const std::string& where) override {
@@ -153,7 +151,7 @@ Status parse_state(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// Three values of an action, an axis times an angle, as Euler angles.
+/// Converts three values of an action from axis times angle to Euler angles.
 struct RotationActionOp final : ActionOp {
   int column = 0;
   Axes axes{};

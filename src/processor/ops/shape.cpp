@@ -1,7 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// The ops that end the list of a state, and those that pick the robot's part of a chunk.
+// Ops that end the state's list, and ops that select the robot's part of a chunk.
 #include <fmt/format.h>
 
 #include <utility>
@@ -33,7 +32,7 @@ struct PadOp final : StateOp {
   }
 };
 
-/// The state goes into the prompt as integers.
+/// Puts the state into the prompt as integers.
 struct BinsOp final : StateOp {
   Bins params;
   Stage stage() const override { return Stage::end; }
@@ -48,7 +47,7 @@ struct BinsOp final : StateOp {
   }
 };
 
-/// The network sees no state.
+/// Drops the state: the network gets none.
 struct DropOp final : StateOp {
   Stage stage() const override { return Stage::end; }
   Status bind(StateLayout& layout, const std::string&) override {
@@ -92,7 +91,7 @@ Status parse_end(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// The first columns, which are the robot's.
+/// Keeps the first columns, which are the robot's.
 struct TakeOp final : ActionOp {
   int size = 0;
   Status bind(ActionLayout& layout, const std::string& where) override {
@@ -111,7 +110,7 @@ Status parse_take(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// The first rows of a chunk, which are what the robot is meant to do.
+/// Keeps the first rows of a chunk, which the robot executes.
 struct RowsOp final : ActionOp {
   int count = 0;
   Status bind(ActionLayout& layout, const std::string& where) override {

@@ -1,7 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// Angles as the network may see them: without a jump at the end of a turn.
+// Encodes angles without a jump at the end of a turn.
 #include <fmt/format.h>
 
 #include <algorithm>
@@ -15,8 +14,8 @@
 namespace vla {
 namespace {
 
-/// In the place of each feature whose columns it names: the sines of these columns, then their cosines.
-/// Source: Isaac-GR00T gr00t/data/utils.py (apply_sin_cos_encoding).
+/// Replaces each feature whose columns it names by the sines of these columns, then their cosines. Source: Isaac-GR00T
+/// gr00t/data/utils.py (apply_sin_cos_encoding).
 struct SinCosOp final : StateOp {
   std::vector<int> columns;
 

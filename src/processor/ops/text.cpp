@@ -119,7 +119,7 @@ struct ReplaceOp final : TextOp {
   }
 };
 
-/// Refuses an instruction that has a certain text. It comes before ops that add text, so that an empty one passes.
+/// Refuses an instruction that contains a text. It runs before ops that add text, so an empty instruction passes.
 struct RefuseOp final : TextOp {
   std::string text;
   Result<std::string> apply(std::string given, std::span<const int>) const override {
