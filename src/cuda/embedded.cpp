@@ -1,7 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// The kernels' PTX, which the build makes, as bytes of the library. embedded_modules.inc lists MODULE(name).
+// The kernels' PTX from the build, as bytes in the library. embedded_modules.inc lists MODULE(name).
 #include "cuda/driver/modules.h"
 
 #define MODULE(name)                                                                                       \

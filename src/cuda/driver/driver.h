@@ -7,8 +7,8 @@
 
 #include "base/result.h"
 
-/// The functions of NVIDIA's driver that we call, behind a table, so that nothing of NVIDIA is needed to build, and a
-/// test can put a driver of its own in the place. Source: CUDA Driver API 13.0.
+/// The functions of NVIDIA's driver that we call, in a table, so that building needs nothing of NVIDIA and a test can
+/// use a driver of its own. Source: CUDA Driver API 13.0.
 namespace vla::cuda {
 
 using Address = std::uint64_t;  // CUdeviceptr
@@ -66,7 +66,7 @@ struct Driver {
 #undef VLA_CUDA_CALL
 };
 
-/// The machine's driver; a device error where there is none, or one that lacks a function.
+/// Loads the machine's driver. Errors: device, if there is none or it lacks a function.
 Result<Driver> load_driver();
 
 }  // namespace vla::cuda

@@ -10,11 +10,11 @@
 #include "cuda/driver/driver.h"
 #include "cuda/kernels/launch.h"
 
-/// A device and what it holds. Every failure of the driver is a typed Error that names the call: out_of_memory where
-/// the driver says so, else device. Nothing is released twice, and failures while releasing are passed over.
+/// A device and its resources. A driver failure is a typed Error that names the call: out_of_memory if the driver says
+/// so, else device. Resources are released once; failures while releasing are ignored.
 namespace vla::cuda {
 
-/// Something of the driver's that ends with this object.
+/// A driver object that is released with this one.
 class Owned {
  public:
   using Release = int (*)(Handle);
@@ -28,7 +28,8 @@ class Owned {
 
 class Gpu;
 
-/// Device memory; it goes before the device does. Without a Gpu it is none, and its address says where it would lie.
+/// Device memory; destroy it before the device. Without a Gpu nothing is allocated, and the address says where it would
+/// be.
 class Buffer {
  public:
   Buffer(const Gpu* gpu, Address address, std::size_t size) : gpu_(gpu), address_(address), size_(size) {}
@@ -37,7 +38,7 @@ class Buffer {
   }
   Buffer& operator=(Buffer&&) = delete;
   ~Buffer();
-  /// As kernels' jobs take it; the host must not follow it.
+  /// The address for kernels' jobs; the host must not dereference it.
   template <class T>
   T* as(std::size_t offset = 0) const {
     return reinterpret_cast<T*>(address_ + offset);
@@ -51,11 +52,11 @@ class Buffer {
   std::size_t size_;
 };
 
-/// Operations in order. Between streams only events order them.
+/// A stream: its operations run in order. Only events order operations of different streams.
 class Stream {
  public:
   Status fill(Address to, unsigned char value, std::size_t size);
-  /// Host memory must stay until the stream was waited for.
+  /// Host memory must stay valid until the stream is waited for.
   Status upload(Address to, const void* from, std::size_t size);
   Status download(void* to, Address from, std::size_t size);
   /// On the device.
@@ -64,23 +65,23 @@ class Stream {
   Status launch(const Launch& how, const Job& job) {
     return launch_job(how, &job);
   }
-  /// `job` points at what the kernel takes.
+  /// Launches a kernel; `job` points to its parameter.
   Status launch_job(const Launch& how, const void* job);
-  /// Until all operations are done.
+  /// Waits until all operations are done.
   Status wait();
-  /// Delays what comes next until all that is in `other` has ended.
+  /// Makes later operations wait for everything in `other` so far.
   Status after(Stream& other);
-  /// `event` stands for all that is in here until now.
+  /// Records `event` after everything in this stream so far.
   Status record(const Owned& event);
-  /// Delays what comes next until all has ended that `event` stands for.
+  /// Makes later operations wait for `event`.
   Status after(const Owned& event);
-  /// While operations are captured: has `event` note the time whenever the graph comes here.
+  /// During capture: records the time in `event` each time the graph gets here.
   Status note_time(const Owned& event);
 
-  /// Operations, also of streams that come after this one, become a graph instead of running; those must be waited for
-  /// with after() before the end.
+  /// Captures operations into a graph instead of running them, also those of streams that wait for this one. Join those
+  /// streams with after() before the end of the capture.
   Status begin_capture();
-  /// The graph, as it is launched.
+  /// The captured graph, instantiated.
   Result<Owned> end_capture();
   Status launch(const Owned& graph);
 
@@ -97,7 +98,7 @@ struct GpuInfo {
   std::string name, driver;
   std::size_t memory;  // bytes
 };
-/// In the order of their numbers. Errors: device where there is none, or the driver is too old, with the reason as
+/// The devices in order of their index. Errors: device if there is none or the driver is too old, with the reason as
 /// `found`.
 Result<std::vector<GpuInfo>> list_gpus(const Driver& driver);
 
@@ -106,16 +107,16 @@ class Gpu {
   /// Driver version and compute capability that our kernels need.
   static constexpr int kMinDriver = 12060, kMinCapability = 80;
 
-  /// Takes the device's context and loads the modules, texts of PTX.
+  /// Opens the device's context and loads the modules from PTX texts.
   static Result<std::unique_ptr<Gpu>> open(const Driver& driver, int device, const std::vector<std::string>& modules);
   Gpu(const Gpu&) = delete;
   ~Gpu();
 
-  /// Makes this the device of the calling thread, which it must be for every call of the driver. What allocates or
-  /// gives back does so itself.
+  /// Makes the device current on the calling thread, as every driver call needs. Functions that allocate or free do
+  /// this themselves.
   Status use() const;
 
-  /// Blocks of big kernels that run at a time, about.
+  /// How many blocks of large kernels run at a time, approximately.
   int n_sm() const { return n_sm_; }
   const std::string& name() const { return name_; }
   /// Has the driver load a kernel and allow it its shared memory, as the first launch does. Before a capture: a driver
@@ -123,12 +124,12 @@ class Gpu {
   Status prepare(const Launch& how);
   /// out_of_memory with both sizes where less is free.
   Result<Buffer> allocate(std::size_t size, const std::string& what);
-  /// Memory of the host that the device reads and writes without the processor.
+  /// Pinned host memory, which the device reads and writes without the processor.
   Result<Owned> allocate_host(std::size_t size);
   Result<Stream> stream();
-  /// For Stream::note_time, or for `record` where it has no time.
+  /// For Stream::note_time, or for `record` without timing.
   Result<Owned> event(bool has_time);
-  /// Milliseconds between the times that two events noted.
+  /// Milliseconds between two recorded events.
   Result<float> elapsed(const Owned& first, const Owned& second) const;
   /// Bytes of device memory.
   Result<std::size_t> free_memory() const;
@@ -141,7 +142,7 @@ class Gpu {
   Result<Owned> load(const std::string& module) const;
   Result<Handle> kernel(const Launch& how);
   Status check(const char* call, int result) const;
-  /// Checks a call that made a handle.
+  /// Checks a call that creates a handle.
   Result<Owned> own(const char* call, int result, Handle handle, Owned::Release release) const;
 
   Driver driver_;
@@ -151,7 +152,7 @@ class Gpu {
   std::vector<Owned> modules_;
   struct Function {
     Handle handle;
-    unsigned shared;  // bytes that it is allowed
+    unsigned shared;  // bytes of shared memory that it may use
   };
   std::map<std::string, Function> functions_;
 };

@@ -7,7 +7,7 @@
 
 namespace vla::cuda {
 
-/// All kernels, as texts that a driver loads: PTX inside of the library, or what the driver of tests knows theirs by.
+/// All kernels as texts for a driver: PTX inside the library, or the names that a test's driver knows.
 std::vector<std::string> kernel_modules();
 
 }  // namespace vla::cuda

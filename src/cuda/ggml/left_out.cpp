@@ -1,9 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// Stand-ins for sources of ggml's CUDA backend that are not built although the rest calls them, because no graph of
-// ours has their operations (src/CMakeLists.txt lists those that are built). The linker tells when one is missing here;
-// a graph that needs one ends the process with its name.
+// Stand-ins for sources of ggml's CUDA backend that the build leaves out, because no graph of ours has their operations
+// (src/CMakeLists.txt lists the sources that are built). The linker reports a missing one; a graph that reaches one
+// ends the process with its name.
 #include <ggml-backend.h>
 #include <ggml.h>
 
@@ -12,11 +11,11 @@
 
 struct ggml_backend_cuda_context;
 struct ggml_cuda_ar_pipeline;
-struct ggml_cuda_gated_delta_net_fused_cache {};  // passed by value, and never read
+struct ggml_cuda_gated_delta_net_fused_cache {};  // passed by value and never read
 struct ggml_cuda_mm_fusion_args_host;
 struct ggml_cuda_topk_moe_args;
 
-// Other ways to compute what is built: none is taken. The first is products of few columns, in TF32.
+// Alternatives to kernels that are built; none is selected. The first would compute products of few columns in TF32.
 bool ggml_cuda_should_use_mmf(ggml_type, int, int, const std::int64_t*, const std::size_t*, int, bool) { return false; }
 bool ggml_cuda_should_use_mmq(ggml_type, int, std::int64_t, std::int64_t) { return false; }
 bool ggml_cuda_should_use_mmvq(ggml_type, int, std::int64_t) { return false; }

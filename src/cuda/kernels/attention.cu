@@ -10,7 +10,7 @@ namespace {
 constexpr float kLog2 = 1.4426950408889634f;
 constexpr float kMinusInfinity = -__builtin_huge_valf();
 
-/// The work of block y: a head of keys and values, of one batch.
+/// The work of block y: one head of keys and values in one batch.
 struct Unit {
   int head_kv, batch;
   VLA_DEVICE explicit Unit(const AttentionJob& job)
@@ -20,17 +20,18 @@ template <class T>
 VLA_DEVICE const T* row_of(const HeadRows& rows, int head, int token, int batch) {
   return static_cast<const T*>(rows.data) + head * rows.head + token * rows.token + batch * rows.batch;
 }
-/// Row r of a unit's queries: those of its heads, one query after the other.
+/// Row r of a unit's queries: the unit's heads for one query, then for the next.
 VLA_DEVICE int query_of(const AttentionJob& job, int row) { return row / job.group(); }
 VLA_DEVICE int head_of(const AttentionJob& job, const Unit& unit, int row) {
   return unit.head_kv * job.group() + row % job.group();
 }
 
-/// Tiles of keys, which no two segments share. Of a split, the blocks take turns.
+/// Iterates over tiles of keys; a tile belongs to one segment. With a split, blocks take tiles in turn.
 template <int kKeys>
 struct Tiles {
   const AttentionJob& job;
-  int segment = 0, first = 0, before = 0, number = 0;  // the tile's segment, its first key there, keys of those before
+  // the tile's segment, its first key in it, number of keys in earlier segments
+  int segment = 0, first = 0, before = 0, number = 0;
 
   VLA_DEVICE explicit Tiles(const AttentionJob& of) : job(of) {
     skip_ends();
@@ -59,9 +60,10 @@ VLA_DEVICE int count_keys(const AttentionJob& job) {
   return n;
 }
 
-/// The largest score as what scores are taken from; any number where a row has seen no key, so that weights are zeros.
+/// The base that is subtracted from scores: the largest score, or any finite value for a row without keys, so that its
+/// weights are zero.
 VLA_DEVICE float finite(float most) { return most == kMinusInfinity ? 0 : most; }
-/// The factor by which what was summed shrinks where the largest score grows.
+/// The factor that rescales the sums when the largest score grows.
 VLA_DEVICE float shrink(float before, float after) { return dev::power_of_two(before - finite(after)); }
 VLA_DEVICE float weight_of(float score, float most) { return dev::power_of_two(score - finite(most)); }
 
@@ -77,7 +79,7 @@ VLA_DEVICE void store_y(const AttentionJob& job, const Unit& unit, int row, int 
   store(job.y, job.is_bf16, at, value);
 }
 
-// On tensor cores: a warp has 16 rows, a block 64
+// Tensor cores: a warp has 16 rows, a block 64
 
 constexpr int kRows = 64, kThreads = 128;
 
@@ -85,12 +87,12 @@ template <int kDepth_>
 struct Shape {
   static constexpr int kDepth = kDepth_, kKeys = kDepth == 256 ? 32 : 64;
   static constexpr int kSteps = kDepth / 16, kTiles = kDepth / 8;
-  /// 16 bytes between rows: the eight that a matrix is read from differ in banks.
+  /// Rows are padded by 16 bytes, so that the eight rows of a matrix load are in different banks.
   static constexpr int kRow = kDepth * 2 + 16, kTile = kKeys * kRow;
   static constexpr bool kKeepsQ = kDepth <= 128;  // queries in registers
 };
 
-/// Rows to shared memory, with zeros behind the last and behind d_head.
+/// Copies rows to shared memory, padded with zeros after the last row and after d_head.
 template <class S, class RowOf>
 VLA_DEVICE void fetch_rows(std::byte* to, int n, int n_valid, int d_head, const void* somewhere, RowOf row_at) {
   constexpr int kChunks = S::kDepth / 8;
@@ -110,7 +112,7 @@ VLA_DEVICE void fetch_keys(const AttentionJob& job, const Unit& unit, const Tile
   fetch_rows<S>(to + S::kTile, S::kKeys, tile.n_key(), job.d_head, segment.v.data, rows(segment.v));
 }
 
-/// One tile's scores of a warp's rows, in units of which 2 is the base.
+/// Scores of one tile for a warp's rows, scaled for exponentials of base 2.
 template <class S>
 VLA_DEVICE void score(const std::byte* q_rows, const unsigned (&q)[S::kSteps][4], const std::byte* k,
                       float (&scores)[S::kKeys / 8][4]) {
@@ -143,7 +145,7 @@ VLA_DEVICE void attend_bf16(const AttentionJob& job) {
   if (ahead.more()) fetch_keys<S>(job, unit, ahead, stages);
   dev::commit_copies();
 
-  // Of a lane's sums, 0 and 1 belong to row lane / 4, 2 and 3 to the one 8 below.
+  // A lane's sums 0 and 1 belong to row lane / 4, sums 2 and 3 to row lane / 4 + 8.
   const float* mask[2] = {};
 #pragma unroll
   for (int h = 0; h < 2; ++h) {
@@ -159,7 +161,7 @@ VLA_DEVICE void attend_bf16(const AttentionJob& job) {
     if (ahead.more()) fetch_keys<S>(job, unit, ahead, stages + (stage ^ 1) * 2 * S::kTile);
     dev::commit_copies();
     dev::wait_copies<1>();
-    __syncthreads();  // the tile has arrived for all threads
+    __syncthreads();  // the tile is visible to all threads
     const std::byte *k = stages + stage * 2 * S::kTile, *v = k + S::kTile;
     if (S::kKeepsQ && tile.number < job.n_split) {
 #pragma unroll
@@ -169,7 +171,7 @@ VLA_DEVICE void attend_bf16(const AttentionJob& job) {
     float scores[S::kKeys / 8][4] = {};
     score<S>(q_rows, q, k, scores);
     const int n_valid = tile.n_key(), first_key = tile.before + tile.first;
-    const auto each = [&](auto change) {  // score, row (0 or 8 below) and key of the tile
+    const auto each = [&](auto change) {  // score, row (0 or 8 below), key in the tile
 #pragma unroll
       for (int n = 0; n < S::kKeys / 8; ++n)
 #pragma unroll
@@ -191,7 +193,7 @@ VLA_DEVICE void attend_bf16(const AttentionJob& job) {
       for (int n = 0; n < S::kTiles; ++n) y[n][2 * h] *= factor, y[n][2 * h + 1] *= factor;
     }
     const float base[2] = {finite(most[0]), finite(most[1])};
-    unsigned weights[S::kKeys / 16][4];  // as the registers of a
+    unsigned weights[S::kKeys / 16][4];  // in the register order of operand a
 #pragma unroll
     for (int n = 0; n < S::kKeys / 8; ++n)
 #pragma unroll
@@ -210,7 +212,7 @@ VLA_DEVICE void attend_bf16(const AttentionJob& job) {
         dev::multiply_bf16(y[n], weights[i], b[0], b[1]);
         dev::multiply_bf16(y[n + 1], weights[i], b[2], b[3]);
       }
-    __syncthreads();  // all have read the stage that is fetched into next
+    __syncthreads();  // all threads have read the stage that is overwritten next
   }
   dev::wait_copies<0>();
 
@@ -248,12 +250,13 @@ VLA_KERNEL(attention_bf16_80, 128, 1, AttentionJob) { attend_bf16<Shape80>(job);
 VLA_KERNEL(attention_bf16_128, 128, 1, AttentionJob) { attend_bf16<Shape128>(job); }
 VLA_KERNEL(attention_bf16_256, 128, 1, AttentionJob) { attend_bf16<Shape256>(job); }
 
-/// A warp has a row, a block eight. A lane has a key while scores are made, and every 32nd element of y.
+/// A warp computes one row, a block eight. A lane has one key while scores are computed, then every 32nd element of y.
 VLA_KERNEL(attention_f32, 256, 2, AttentionJob) {
   constexpr int kKeys = 32, kPerLane = kMaxHead / kLanes;
   const int lane = thread_index() % kLanes, warp = thread_index() / kLanes;
   const int row = static_cast<int>(blockIdx.x) * 8 + warp, n_key = count_keys(job), d = job.d_head;
-  const int width = (d + 31) / 32 * 32 + 1;  // of a row in shared memory: lanes that read a column differ in banks
+  // row stride in shared memory: lanes that read a column are in different banks
+  const int width = (d + 31) / 32 * 32 + 1;
   std::byte *k = dev::shared_memory(), *v = k + kKeys * width * 4, *q = v + (kKeys + warp) * width * 4;
   const Unit unit(job);
   const bool valid = row < job.n_row();
@@ -264,7 +267,7 @@ VLA_KERNEL(attention_f32, 256, 2, AttentionJob) {
   float y[kPerLane] = {}, most = kMinusInfinity, total = 0;
   for (Tiles<kKeys> tile(job); tile.more(); tile.next()) {
     const AttentionJob::Segment& segment = job.segment[tile.segment];
-    __syncthreads();  // all have read the tile before
+    __syncthreads();  // all threads have read the previous tile
     for (int key = warp; key < tile.n_key(); key += 8) {
       const float* from_k = row_of<float>(segment.k, unit.head_kv, tile.first + key, unit.batch);
       const float* from_v = row_of<float>(segment.v, unit.head_kv, tile.first + key, unit.batch);
@@ -310,7 +313,7 @@ VLA_KERNEL(attention_f32, 256, 2, AttentionJob) {
   }
 }
 
-/// y of sums over shares of the keys; a warp has a row.
+/// Combines the partial sums of a split; a warp computes one row.
 VLA_KERNEL(attention_finish, 128, 4, AttentionJob) {
   const int lane = thread_index() % kLanes, row = static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes;
   const Unit unit(job);

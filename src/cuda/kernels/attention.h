@@ -4,17 +4,17 @@
 
 #include "cuda/kernels/launch.h"
 
-/// softmax(q k * scale + mask) v of every query and head, without a matrix of scores in memory.
+/// softmax(q k * scale + mask) v for every query and head, without a score matrix in memory.
 namespace vla::cuda {
 
-/// Rows of d_head elements: elements from one head, token or batch to the next.
+/// Rows of d_head elements, with strides between heads, tokens and batches.
 struct HeadRows {
   const void* data;
   std::int64_t head, token, batch;
 };
 
 struct AttentionJob {
-  /// Keys and values that stand one after the other.
+  /// A segment of keys and values.
   struct Segment {
     HeadRows k, v;
     int n_key;
@@ -23,24 +23,25 @@ struct AttentionJob {
 
   HeadRows q;
   Segment segment[kMaxSegment];
-  const float* mask;  // [n_key, n_query] of any values but +infinity, or null
+  const float* mask;  // [n_key, n_query], any values except +infinity, or null
   void* y;            // [d_head, n_head, n_query, n_batch], float32 or bf16
-  /// With more than one split, a share of the keys each: sums of values, and for every row its largest score and sum of
-  /// weights, go to partial [d_head + 2, n_row, n_head_kv * n_batch, n_split]; `finish_attention` makes y of them.
+  /// With more than one split each takes a share of the keys. Sums of values, and for every row its largest score and
+  /// sum of weights, go to partial [d_head + 2, n_row, n_head_kv * n_batch, n_split]; `finish_attention` computes y
+  /// from them.
   float* partial;
   float scale;
   int n_segment, n_query, n_head, n_head_kv, n_batch, d_head, n_split;
-  bool is_bf16;  // y; else float32
+  bool is_bf16;  // whether y is bf16, else float32
 
-  /// Query heads that share keys and values: their queries are rows of one and the same product.
+  /// Query heads per key head. Their queries are rows of the same product.
   VLA_HOST_DEVICE int group() const { return n_head / n_head_kv; }
   VLA_HOST_DEVICE int n_row() const { return group() * n_query; }
 };
 
 constexpr int kMaxHead = 256;
 
-/// On tensor cores: q, k and v are bf16, d_head is a multiple of 8, and so is every stride; weights are rounded to
-/// bf16, sums and softmax are float32.
+/// On tensor cores: q, k and v are bf16; d_head and all strides are multiples of 8. Weights are rounded to bf16, sums
+/// and softmax are float32.
 inline Launch attention_bf16(const AttentionJob& job) {
   const int depth = job.d_head <= 64 ? 64 : job.d_head <= 80 ? 80 : job.d_head <= 128 ? 128 : 256;
   const char* name = depth == 64    ? "attention_bf16_64"
@@ -54,7 +55,7 @@ inline Launch attention_bf16(const AttentionJob& job) {
       128,
       static_cast<unsigned>((64 + 4 * n_key) * (depth * 2 + 16))};
 }
-/// In float32 throughout, of any d_head.
+/// In float32, for any d_head.
 inline Launch attention_f32(const AttentionJob& job) {
   return {
       "attention_f32",

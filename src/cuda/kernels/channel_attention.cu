@@ -11,8 +11,8 @@ namespace {
 
 constexpr float kLogOfE = 1.44269504f;  // to base 2
 
-/// The score of feature i of the queries and feature j of the keys, over all tokens. Products of 64 tokens are added up
-/// before they are added to the rest, or thousands of them would cost a digit.
+/// The score of query feature i and key feature j over all tokens. Products are summed over 64 tokens before they are
+/// added to the total; thousands of single additions would cost a digit.
 VLA_DEVICE float score(const ChannelAttentionJob& job, const float* q, const float* k) {
   float total = 0;
   for (int first = 0; first < job.n; first += 64) {
@@ -26,7 +26,7 @@ VLA_DEVICE float score(const ChannelAttentionJob& job, const float* q, const flo
 
 }  // namespace
 
-/// Scores in shared memory, [key, query]; their softmax; what it makes of the values.
+/// Computes scores in shared memory, [key, query], their softmax, and the weighted sums of values.
 VLA_KERNEL(channel_attention, 256, 4, ChannelAttentionJob) {
   std::byte* const room = dev::shared_memory();
   const int d = job.d_group(), n_pair = d * d;

@@ -4,13 +4,13 @@
 
 #include "cuda/kernels/launch.h"
 
-/// Attention of features to features (op::ChannelAttention): a block has one group of one view.
+/// Attention between features (op::ChannelAttention). A block computes one group of one view.
 namespace vla::cuda {
 
-/// Features of a group that the kernel takes.
+/// The most features in a group.
 constexpr int kMaxChannels = 64;
 
-/// q, k, v, y [d, n, n_view], tokens `q_stride` and so on apart, views `n` tokens apart.
+/// q, k, v, y [d, n, n_view]; `q_stride` and so on are strides of tokens, and views are `n` tokens apart.
 struct ChannelAttentionJob {
   const float *q, *k, *v;
   float* y;
@@ -20,7 +20,7 @@ struct ChannelAttentionJob {
   VLA_HOST_DEVICE int d_group() const { return d / n_group; }
 };
 
-/// A thread has scores of one query, and later tokens of it.
+/// A thread computes scores of one query feature, later tokens of it.
 inline Launch channel_attention(const ChannelAttentionJob& job) {
   const unsigned d = static_cast<unsigned>(job.d_group());
   return {"channel_attention", {static_cast<unsigned>(job.n_group), static_cast<unsigned>(job.n_view)}, 256, d * d * 4};

@@ -2,28 +2,29 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-/// The instructions that kernels use beyond CUDA C++. The host's compiler takes tests/cuda/emulation.h in their place,
-/// which the build includes before every kernel. Source of layouts and operands: PTX ISA 9.0.
+/// The instructions beyond CUDA C++ that kernels use. For the host's compiler tests/cuda/emulation.h replaces this
+/// file; the build includes it before every kernel. Source of layouts and operands: PTX ISA 9.0.
 #include <cstddef>
 #include <cstdint>
 
 #ifdef __CUDACC__
 
 #define VLA_DEVICE __device__ __forceinline__
-/// Defines a kernel with one parameter, `job`, under a plain name: at most `threads` a block, registers for `blocks`.
+/// Defines a kernel with one parameter, `job`, under an unmangled name: at most `threads` threads per block, registers
+/// for `blocks` blocks.
 #define VLA_KERNEL(name, threads, blocks, Job) \
   extern "C" __global__ void __launch_bounds__(threads, blocks) name(const __grid_constant__ Job job)
 
 namespace vla::cuda::dev {
 
-/// Shared memory whose size the launch tells.
+/// Shared memory whose size the launch sets.
 VLA_DEVICE std::byte* shared_memory() {
   extern __shared__ __align__(1024) std::byte bytes[];
   return bytes;
 }
 VLA_DEVICE unsigned shared_address(const void* p) { return static_cast<unsigned>(__cvta_generic_to_shared(p)); }
 
-/// Elements of shared memory. Kernels use nothing else to reach it, so that the emulation sees every access.
+/// Access to shared memory. Kernels use nothing else for it, so that the emulation sees every access.
 template <class T>
 VLA_DEVICE T read(const std::byte* p) {
   return *reinterpret_cast<const T*>(p);
@@ -33,27 +34,27 @@ VLA_DEVICE void write(std::byte* p, const T& value) {
   *reinterpret_cast<T*>(p) = value;
 }
 
-/// `size` bytes, at most 16, from global to shared memory without waiting; zeros behind them up to 16.
+/// Copies `size` bytes, at most 16, from global to shared memory asynchronously, padded with zeros to 16.
 VLA_DEVICE void copy_async(std::byte* to, const void* from, int size) {
   asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" ::"r"(shared_address(to)), "l"(from), "r"(size)
                : "memory");
 }
 VLA_DEVICE void commit_copies() { asm volatile("cp.async.commit_group;" ::: "memory"); }
-/// Until all groups of this thread but the latest kLeft have arrived.
+/// Waits until all but the latest kLeft groups of this thread have arrived.
 template <int kLeft>
 VLA_DEVICE void wait_copies() {
   asm volatile("cp.async.wait_group %0;" ::"n"(kLeft) : "memory");
 }
 
-/// Four matrices of 8 rows of 16 bytes: lane 8 j + i has the address of row i of matrix j; lane l gets bytes 4 (l % 4)
-/// to + 3 of row l / 4 of each.
+/// Loads four matrices of 8 rows of 16 bytes. Lane 8 j + i passes the address of row i of matrix j; lane l gets bytes 4
+/// (l % 4) to 4 (l % 4) + 3 of row l / 4 of each.
 VLA_DEVICE void load_matrices(unsigned (&to)[4], const std::byte* from) {
   asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
                : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
                : "r"(shared_address(from))
                : "memory");
 }
-/// The same of the transposed matrices of 16-bit elements.
+/// The same for transposed matrices of 16-bit elements.
 VLA_DEVICE void load_transposed(unsigned (&to)[4], const std::byte* from) {
   asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
                : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
@@ -74,10 +75,10 @@ VLA_DEVICE void multiply_bf16(float (&sum)[4], const unsigned (&a)[4], unsigned 
       : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
       : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
 }
-/// sum + the products of the four signed bytes of a and b.
+/// sum + the dot product of the four signed bytes of a and b.
 VLA_DEVICE int dot4(unsigned a, unsigned b, int sum) { return __dp4a(static_cast<int>(a), static_cast<int>(b), sum); }
 
-/// The value of the lane whose number differs in the bits of `mask`.
+/// The value of the lane whose index differs in the bits of `mask`.
 template <class T>
 VLA_DEVICE T shuffle_xor(T value, int mask) {
   return __shfl_xor_sync(0xffffffffU, value, mask);
@@ -87,7 +88,8 @@ VLA_DEVICE T shuffle(T value, int lane) {
   return __shfl_sync(0xffffffffU, value, lane);
 }
 
-// Each rounded by itself, where bits must be those of another machine: nvcc would fuse a product and a sum.
+// Operations that are rounded separately, for results equal to another machine's to the bit: nvcc would fuse a product
+// and a sum.
 VLA_DEVICE float multiply(float a, float b) { return __fmul_rn(a, b); }
 VLA_DEVICE float add(float a, float b) { return __fadd_rn(a, b); }
 VLA_DEVICE float divide(float a, float b) { return __fdiv_rn(a, b); }
@@ -99,13 +101,13 @@ VLA_DEVICE unsigned to_bf16(float low, float high) {
   asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(pair) : "f"(high), "f"(low));
   return pair;
 }
-/// A number of 16 bits, exactly.
+/// Widens a 16-bit float exactly.
 VLA_DEVICE float from_f16(unsigned bits) {
   float x;
   asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(static_cast<unsigned short>(bits)));
   return x;
 }
-/// 2^x, within 2^-22 of it; zero for minus infinity, and for what is no normal number.
+/// 2^x with a relative error of 2^-22; zero for minus infinity and below the normal floats.
 VLA_DEVICE float power_of_two(float x) {
   float y;
   asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
@@ -124,7 +126,7 @@ constexpr int kLanes = 32;
 
 VLA_DEVICE int thread_index() { return static_cast<int>(threadIdx.x); }
 VLA_DEVICE float from_bf16(std::uint16_t bits) { return dev::float_of(static_cast<int>(bits) << 16); }
-/// Element `at` of what is bf16 or float32.
+/// Element `at` of an array of bf16 or float32.
 VLA_DEVICE void store(void* y, bool is_bf16, std::int64_t at, float value) {
   if (is_bf16)
     static_cast<std::uint16_t*>(y)[at] = static_cast<std::uint16_t>(dev::to_bf16(value, 0));
@@ -132,7 +134,7 @@ VLA_DEVICE void store(void* y, bool is_bf16, std::int64_t at, float value) {
     static_cast<float*>(y)[at] = value;
 }
 
-/// Over the lanes of a warp, for all of them, in the same order everywhere.
+/// Reduces over the lanes of a warp, with the result in all of them, in the same order everywhere.
 VLA_DEVICE float sum_of_warp(float x) {
   for (int mask = 16; mask > 0; mask /= 2) x += dev::shuffle_xor(x, mask);
   return x;
@@ -149,8 +151,8 @@ VLA_DEVICE int most_of_warp(int x) {
   return x;
 }
 
-/// The same over the warps of a block, by `combine` of two values, through a word of shared memory for each warp. All
-/// threads call it; `room` may be used again after their next barrier.
+/// Reduces over the warps of a block with `combine`, through one word of shared memory per warp. All threads must call
+/// it; `room` may be reused after their next barrier.
 template <class T, class Combine>
 VLA_DEVICE T across_warps(T of_warp, std::byte* room, Combine combine) {
   const int n_warp = static_cast<int>(blockDim.x) / kLanes;

@@ -7,17 +7,17 @@
 
 namespace vla::cuda {
 
-/// The steps behind a product's sums: y = activation(sum + bias) * factor + residual, or the ReLU of that; or, where
-/// there is a gate, y = activation(gate) * (sum + bias) * factor + residual. All but y may be null.
+/// What follows a product's sums: y = activation(sum + bias) * factor + residual, or the ReLU of that; with a gate y =
+/// activation(gate) * (sum + bias) * factor + residual. All operands except y may be null.
 struct Epilogue {
   const float* bias;      // [n_column]
   const float* factor;    // [n_column]
   const float* gate;      // [n_column, n_row]
   const float* residual;  // [n_column, n_row]
-  void* y;                // rows of y_stride elements, of which n_column are written
+  void* y;                // rows with a stride of y_stride elements, of which n_column are written
   std::int64_t y_stride;
   Activation activation;
-  bool is_bf16;  // y; else float32
+  bool is_bf16;  // whether y is bf16, else float32
   bool ends_in_relu;
 };
 

@@ -7,19 +7,19 @@
 
 namespace vla::cuda {
 
-/// Within some units in the last place. Not a switch, for which nvcc would make a table of jumps in every place.
+/// Within a few units in the last place. Written without a switch, because nvcc would build a jump table at every use.
 /// Sources: torch silu, gelu, relu.
 VLA_DEVICE float activate(Activation activation, float x) {
   if (activation == Activation::none) return x;
   if (activation == Activation::gelu_erf) return 0.5f * x * (1 + erff(0.70710678f * x));
   if (activation == Activation::relu) return x < 0 ? 0 : x;
   if (activation == Activation::relu_squared) return x < 0 ? 0 : x * x;
-  // x / (1 + e^-u): with u = x that is SiLU, and as 1 + tanh(u / 2) = 2 / (1 + e^-u) also GELU's tanh form.
+  // x / (1 + e^-u). With u = x this is SiLU; since 1 + tanh(u / 2) = 2 / (1 + e^-u), it also gives GELU's tanh form.
   const float u = activation == Activation::silu ? x : 1.5957691216f * (x + 0.044715f * x * x * x);
   return x / (1 + expf(-u));
 }
 
-/// y of one sum. No product and sum are fused, so that y without an activation is the CPU's to the bit.
+/// y of one sum. Products and sums are not fused, so y without an activation equals the CPU's to the bit.
 VLA_DEVICE float finish(const Epilogue& e, float sum, std::int64_t row, int column, int n_column) {
   const std::int64_t at = row * n_column + column;
   if (e.bias) sum = dev::add(sum, e.bias[column]);
@@ -29,7 +29,7 @@ VLA_DEVICE float finish(const Epilogue& e, float sum, std::int64_t row, int colu
   return e.ends_in_relu ? activate(Activation::relu, sum) : sum;
 }
 
-/// Stores y of two sums side by side, of which the second may lie behind the last column.
+/// Stores y of two adjacent sums; the second may be after the last column.
 VLA_DEVICE void finish_pair(const Epilogue& e, float first, float second, std::int64_t row, int column, int n_column) {
   const bool has_second = column + 1 < n_column;
   first = finish(e, first, row, column, n_column);

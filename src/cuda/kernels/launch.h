@@ -11,24 +11,24 @@ struct Grid {
   unsigned x = 1, y = 1, z = 1;
 };
 
-/// A kernel by name and how it is launched. Its one parameter is the job of the header that made this.
+/// A kernel's name and launch configuration. Its one parameter is the job that the header defines.
 struct Launch {
   const char* kernel;
   Grid grid;
   unsigned n_thread;
-  unsigned shared = 0;  // bytes of shared memory whose size the launch tells
+  unsigned shared = 0;  // bytes of dynamic shared memory
 };
 
-/// Marks functions that kernels and their launches share.
+/// Marks functions that kernels and host code share.
 #ifdef __CUDACC__
 #define VLA_HOST_DEVICE __host__ __device__
 #else
 #define VLA_HOST_DEVICE
 #endif
 
-/// Shared memory of a block on the devices that have least: sm_86, sm_89 and sm_120.
+/// Largest shared memory of a block on the devices with least: sm_86, sm_89 and sm_120.
 constexpr unsigned kMaxShared = 99 << 10;
-/// Blocks of a grid in y and z.
+/// Most blocks of a grid in y and z.
 constexpr unsigned kMaxGridYZ = 65535;
 
 constexpr unsigned blocks(std::int64_t n, std::int64_t size) { return static_cast<unsigned>((n + size - 1) / size); }

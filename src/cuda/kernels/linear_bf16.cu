@@ -8,7 +8,7 @@
 namespace vla::cuda {
 namespace {
 
-/// Stores two sums side by side: themselves where the depth is split, else y.
+/// Stores two adjacent sums: the sums themselves if the depth is split, else y.
 VLA_DEVICE void store_pair(const LinearBf16Job& job, float first, float second, int row, int column) {
   if (job.n_split == 1) return finish_pair(job.end, first, second, row, column, job.n_column);
   float* to = job.partial + (static_cast<std::int64_t>(blockIdx.z) * job.n_row + row) * job.n_column + column;
@@ -16,7 +16,7 @@ VLA_DEVICE void store_pair(const LinearBf16Job& job, float first, float second, 
   if (column + 1 < job.n_column) to[1] = second;
 }
 
-/// Steps of the depth that block z of a split takes.
+/// The steps of the depth that block z of a split computes.
 struct Share {
   int first, end;
   VLA_DEVICE explicit Share(const LinearBf16Job& job) {
@@ -25,8 +25,8 @@ struct Share {
   }
 };
 
-/// Four warps, two by two, of kTilesM x kTilesN products of 16 x 8 each, and kStages steps of the depth in shared
-/// memory.
+/// Four warps in a 2 x 2 grid. Each computes kTilesM x kTilesN products of 16 x 8. Shared memory holds kStages steps of
+/// the depth.
 template <int kTilesM_, int kTilesN_>
 struct Shape {
   static constexpr int kTilesM = kTilesM_, kTilesN = kTilesN_, kStages = 4;
@@ -34,10 +34,10 @@ struct Shape {
   static constexpr int kRowBytes = kBf16Depth * 2, kStage = (kRows + kColumns) * kRowBytes;
 };
 
-/// Place of 16 bytes of a row in a stage. The eight rows that a matrix is read from differ in banks.
+/// Offset of 16 bytes of a row in a stage. The eight rows of a matrix load are in different banks.
 VLA_DEVICE int place(int row, int chunk) { return row * kBf16Depth * 2 + (chunk ^ (row >> 1 & 3)) * 16; }
 
-/// Copies a step of the depth of rows to a stage, with zeros behind the last row and behind the depth.
+/// Copies a step of the depth of some rows to a stage, padded with zeros after the last row and the depth.
 template <int kRows>
 VLA_DEVICE void fetch(std::byte* to, const std::uint16_t* from, std::int64_t stride, int row0, int n_row, int step,
                       int depth) {
@@ -57,7 +57,7 @@ VLA_DEVICE void fetch(const LinearBf16Job& job, int row0, int column0, int step,
                      job.depth);
 }
 
-/// Multiplies a stage: two steps of 16 of the depth.
+/// Multiplies a stage in two steps of 16 of the depth.
 template <class S>
 VLA_DEVICE void multiply_stage(const std::byte* stage, int warp_row, int warp_column,
                                float (&sum)[S::kTilesM][S::kTilesN][4]) {
@@ -71,7 +71,7 @@ VLA_DEVICE void multiply_stage(const std::byte* stage, int warp_row, int warp_co
       dev::load_matrices(a[m], stage + place(warp_row + m * 16 + lane % 16, half * 2 + lane / 16));
 #pragma unroll
     for (int n = 0; n < S::kTilesN; n += 2) {
-      unsigned b[4];  // two registers for each of two times eight columns
+      unsigned b[4];  // two registers for each half of 16 columns
       dev::load_matrices(b, w + place(warp_column + n * 8 + lane / 16 * 8 + lane % 8, half * 2 + lane / 8 % 2));
 #pragma unroll
       for (int m = 0; m < S::kTilesM; ++m) {
@@ -94,12 +94,12 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
 #pragma unroll
   for (int i = 0; i < S::kStages - 1; ++i) {
     if (share.first + i < share.end) fetch<S>(job, row0, column0, share.first + i, shared + i * S::kStage);
-    dev::commit_copies();  // a group, even an empty one: waiting counts groups
+    dev::commit_copies();  // commits a group even if it is empty, because waiting counts groups
   }
   for (int step = share.first; step < share.end; ++step) {
     const int i = step - share.first;
     dev::wait_copies<S::kStages - 2>();
-    __syncthreads();  // the stage has arrived for all threads, and all have read the one that is fetched into next
+    __syncthreads();  // the stage is visible to all threads, and all have read the stage that is overwritten next
     const int ahead = i + S::kStages - 1;
     if (share.first + ahead < share.end)
       fetch<S>(job, row0, column0, share.first + ahead, shared + ahead % S::kStages * S::kStage);
@@ -108,14 +108,14 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
   }
 
   dev::wait_copies<0>();
-  __syncthreads();  // the stages become room for sums
+  __syncthreads();  // the stages' memory is reused for sums
   store_sums(sum, shared + warp * kSumBytes<S::kTilesN>, [&](int row, int column, float first, float second) {
     row += row0 + warp_row, column += column0 + warp_column;
     if (row < job.n_row && column < job.n_column) store_pair(job, first, second, row, column);
   });
 }
 
-/// Elements k to k + 7 of a row, zero from `end` on. `is_aligned`: every row begins at a multiple of 16 bytes.
+/// Elements k to k + 7 of a row, zeros from `end` on. `is_aligned`: every row is aligned to 16 bytes.
 VLA_DEVICE void eight(const float* row, int k, int end, bool is_aligned, float (&to)[8]) {
   if (is_aligned && k + 8 <= end) {
 #pragma unroll
@@ -129,7 +129,7 @@ VLA_DEVICE void eight(const float* row, int k, int end, bool is_aligned, float (
   }
 }
 
-/// A warp has two columns and up to kBf16FewRows rows; its lanes share the depth.
+/// A warp computes two columns of up to kBf16FewRows rows; its lanes split the depth.
 VLA_DEVICE void multiply_few(const LinearBf16Job& job) {
   const int lane = thread_index() % kLanes, column = (static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes) * 2;
   const int row0 = static_cast<int>(blockIdx.y) * kBf16FewRows;
@@ -162,7 +162,7 @@ VLA_DEVICE void multiply_few(const LinearBf16Job& job) {
       for (int i = 0; i < 8; ++i) sum[r][0] += x[i] * w[0][i], sum[r][1] += x[i] * w[1][i];
     }
   }
-  float first = 0, second = 0;  // of the row that this lane stores
+  float first = 0, second = 0;  // the row that this lane stores
 #pragma unroll
   for (int r = 0; r < kBf16FewRows; ++r) {
     const float one = sum_of_warp(sum[r][0]), two = sum_of_warp(sum[r][1]);
@@ -180,7 +180,7 @@ VLA_KERNEL(linear_bf16_128, 128, 2, LinearBf16Job) { multiply<Shape128>(job); }
 VLA_KERNEL(linear_bf16_64, 128, 4, LinearBf16Job) { multiply<Shape64>(job); }
 VLA_KERNEL(linear_bf16_few, 128, 4, LinearBf16Job) { multiply_few(job); }
 
-/// y of sums over a split depth.
+/// Adds the partial sums of a split and computes y.
 VLA_KERNEL(linear_bf16_finish, 128, 4, LinearBf16Job) {
   const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 2;
   if (column >= job.n_column) return;

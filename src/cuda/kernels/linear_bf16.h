@@ -5,26 +5,28 @@
 #include "cuda/kernels/epilogue.h"
 #include "cuda/kernels/launch.h"
 
-/// Products of rows and a bf16 matrix with sums in float32, and the epilogue. Tensor cores want rows of bf16; few rows
-/// are float32, as rounding them would save nothing.
+/// Products of rows and a bf16 matrix with sums in float32, and the epilogue. Tensor cores take rows of bf16. For few
+/// rows x stays float32, since rounding it would save nothing.
 namespace vla::cuda {
 
 struct LinearBf16Job {
-  const void* x;                // n_row rows, x_stride elements apart: float32 for few, else bf16 and a multiple of 8
-  const std::uint16_t* weight;  // n_column rows, weight_stride apart, a multiple of 8
+  // n_row rows with stride x_stride: float32 for few rows, else bf16 with a stride that is a multiple of 8
+  const void* x;
+  const std::uint16_t* weight;  // n_column rows with stride weight_stride, a multiple of 8
   std::int64_t x_stride, weight_stride;
-  int n_row, n_column, depth;  // what lies behind the depth in a row is not looked at
-  /// With more than one split, sums of a share of the depth go to partial [n_column, n_row, n_split], and
-  /// `finish_bf16_partial` adds them, in order, and makes y.
+  int n_row, n_column, depth;  // elements of a row after the depth are ignored
+  /// With more than one split, sums over a share of the depth go to partial [n_column, n_row, n_split];
+  /// `finish_bf16_partial` adds them in order and computes y.
   int n_split;
   float* partial;
   Epilogue end;
 };
 
-/// Rows of a block on tensor cores; few: up to kBf16FewRows in all, bound by reading the matrix once.
+/// Rows of a block on tensor cores; few: up to kBf16FewRows rows in all, where reading the matrix once is the
+/// bottleneck.
 enum class Bf16Shape { few, rows64, rows128 };
 constexpr int kBf16FewRows = 8;
-constexpr int kBf16Depth = 32;  // a step of the depth, the unit of a split
+constexpr int kBf16Depth = 32;  // step of the depth, and unit of a split
 
 inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
   const auto splits = static_cast<unsigned>(job.n_split);

@@ -9,7 +9,8 @@ namespace {
 
 constexpr int kSize = 64, kDepth = 16, kStride = kSize + 4, kThreads = 256;
 
-/// A step of the depth of 64 rows to shared memory, the depth first, with zeros behind the last row and the depth.
+/// Copies a step of the depth of 64 rows to shared memory, transposed, padded with zeros after the last row and the
+/// depth.
 VLA_DEVICE void fetch(std::byte* to, const float* from, std::int64_t stride, int row0, int n_row, int k0, int depth) {
 #pragma unroll
   for (int i = thread_index(); i < kSize * kDepth; i += kThreads) {
@@ -21,7 +22,7 @@ VLA_DEVICE void fetch(std::byte* to, const float* from, std::int64_t stride, int
 
 }  // namespace
 
-/// A thread has 4 x 4 sums: rows 4 (thread / 16) and columns 4 (thread % 16) on.
+/// A thread computes 4 x 4 sums, starting at row 4 (thread / 16) and column 4 (thread % 16).
 VLA_KERNEL(linear_f32, 256, 2, LinearF32Job) {
   std::byte *x = dev::shared_memory(), *w = x + kDepth * kStride * 4;
   const int row0 = static_cast<int>(blockIdx.y) * kSize, column0 = static_cast<int>(blockIdx.x) * kSize;
@@ -41,7 +42,7 @@ VLA_KERNEL(linear_f32, 256, 2, LinearF32Job) {
 #pragma unroll
         for (int j = 0; j < 4; ++j) sum[i][j] += rows[i] * columns[j];
     }
-    __syncthreads();  // all have read what the next step writes
+    __syncthreads();  // all threads have read what the next step overwrites
   }
 #pragma unroll
   for (int i = 0; i < 4; ++i)

@@ -5,11 +5,11 @@
 #include "cuda/kernels/epilogue.h"
 #include "cuda/kernels/launch.h"
 
-/// Products in float32, for what must not be rounded, and the epilogue.
+/// Products in float32, for operands that must not be rounded, and the epilogue.
 namespace vla::cuda {
 
 struct LinearF32Job {
-  const float* x;       // n_row rows, x_stride elements apart
+  const float* x;       // n_row rows with stride x_stride
   const float* weight;  // n_column rows of `depth`
   std::int64_t x_stride;
   int n_row, n_column, depth;

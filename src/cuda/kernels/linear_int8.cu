@@ -10,8 +10,7 @@ namespace {
 
 constexpr int kDepth = Int8Tile::kDepth;
 
-/// float(sum) * (scale of the column / scale of the row). The scale of a row lies behind its codes, and the sum of
-/// them behind that.
+/// float(sum) * (scale of the column / scale of the row). After a row's codes come its scale and the sum of its codes.
 struct RowScale {
   float s;
   int sum;
@@ -24,8 +23,8 @@ struct RowScale {
   }
 };
 
-/// Stores two sums side by side: themselves where the depth is split, else y. Of a split the first takes the offset
-/// off.
+/// Stores two adjacent sums: the sums themselves if the depth is split, else y. The first block of a split subtracts
+/// the offset.
 template <CodeKind kKind>
 VLA_DEVICE void store_pair(const LinearInt8Job& job, const RowScale& of_row, int first, int second, int row,
                            int column) {
@@ -42,7 +41,7 @@ VLA_DEVICE void store_pair(const LinearInt8Job& job, const RowScale& of_row, int
               has_second ? of_row.scaled(second, job.scale[column + 1]) : 0, row, column, job.n_column);
 }
 
-/// Steps of the depth that block z of a split takes.
+/// The steps of the depth that block z of a split computes.
 struct Share {
   int first, end;
   VLA_DEVICE explicit Share(const LinearInt8Job& job) {
@@ -53,8 +52,8 @@ struct Share {
 
 // On tensor cores
 
-/// Four warps, two by two, of kTilesM x kTilesN products of 16 x 8 each, and kStages steps of the depth in shared
-/// memory.
+/// Four warps in a 2 x 2 grid. Each computes kTilesM x kTilesN products of 16 x 8. Shared memory holds kStages steps of
+/// the depth.
 template <CodeKind kKind_, int kTilesM_, int kTilesN_>
 struct Shape {
   static constexpr CodeKind kKind = kKind_;
@@ -65,7 +64,7 @@ struct Shape {
   static constexpr int kBytesX = kRows * kDepth, kBytesW = kColumns * kColumnBytes, kStage = kBytesX + kBytesW;
 };
 
-/// Place of 16 bytes of a row of x in a stage. The eight rows that a matrix is read from differ in banks.
+/// Offset of 16 bytes of a row of x in a stage. The eight rows of a matrix load are in different banks.
 VLA_DEVICE int x_place(int row, int chunk) { return row * kDepth + (chunk ^ (row >> 1 & 3)) * 16; }
 
 /// Copies a step of the depth to a stage.
@@ -91,13 +90,13 @@ VLA_DEVICE void fetch(const LinearInt8Job& job, int row0, int column0, int step,
   }
 }
 
-/// Multiplies a stage: two steps of 32 of the depth.
+/// Multiplies a stage in two steps of 32 of the depth.
 template <class S>
 VLA_DEVICE void multiply_stage(const std::byte* stage, int warp_row, int warp_column,
                                int (&sum)[S::kTilesM][S::kTilesN][4]) {
   const int lane = thread_index() % kLanes;
   const std::byte* w = stage + S::kBytesX + warp_column / 32 * S::kTileBytes + lane * 16;
-  unsigned codes[S::kTilesN][4];  // of ternary ones the first is the word of two bits, for all fragments
+  unsigned codes[S::kTilesN][4];  // for ternary weights the first is the word of 2-bit codes for all fragments
 #pragma unroll
   for (int n = 0; n < S::kTilesN; n += S::kKind == CodeKind::ternary ? 4 : 1) {
     const uint4 words = dev::read<uint4>(w + n / 4 * S::kTileBytes + n % 4 * 512);
@@ -136,12 +135,12 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
 #pragma unroll
   for (int i = 0; i < S::kStages - 1; ++i) {
     if (share.first + i < share.end) fetch<S>(job, row0, column0, share.first + i, shared + i * S::kStage);
-    dev::commit_copies();  // a group, even an empty one: waiting counts groups
+    dev::commit_copies();  // commits a group even if it is empty, because waiting counts groups
   }
   int stage = 0, next = S::kStages - 1;
   for (int step = share.first; step < share.end; ++step) {
     dev::wait_copies<S::kStages - 2>();
-    __syncthreads();  // the stage has arrived for all threads, and all have read the one that is fetched into next
+    __syncthreads();  // the stage is visible to all threads, and all have read the stage that is overwritten next
     if (step + S::kStages - 1 < share.end)
       fetch<S>(job, row0, column0, step + S::kStages - 1, shared + next * S::kStage);
     dev::commit_copies();
@@ -151,7 +150,7 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   }
 
   dev::wait_copies<0>();
-  __syncthreads();  // the stages become room for sums
+  __syncthreads();  // the stages' memory is reused for sums
   store_sums(sum, shared + warp * kSumBytes<S::kTilesN>, [&](int row, int column, int first, int second) {
     row += row0 + warp_row, column += column0 + warp_column;
     if (row < job.n_row && column < job.n_column)
@@ -159,11 +158,11 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   });
 }
 
-// Four bytes at a time, for few rows: bound by the matrix, which is read once
+// For few rows, four bytes at a time: reading the matrix once is the bottleneck
 
 constexpr int kFewRows = 4;
 
-/// A warp has a tile of columns; each lane sums a quarter of the depth for four of them.
+/// A warp computes a tile of columns; each lane sums a quarter of the depth for four of them.
 template <CodeKind kKind>
 VLA_DEVICE void multiply_few(const LinearInt8Job& job) {
   constexpr int kTileBytes = kKind == CodeKind::ternary ? Int8Tile::kTernaryBytes : Int8Tile::kBytes;
@@ -200,13 +199,13 @@ VLA_DEVICE void multiply_few(const LinearInt8Job& job) {
   }
 #pragma unroll
   for (int r = 0; r < kFewRows; ++r) {
-    int first = 0, second = 0;  // of the four lanes that share columns each stores another pair
+    int first = 0, second = 0;  // each of the four lanes that share columns stores another pair
 #pragma unroll
     for (int j = 0; j < 4; ++j) {
       int total = sum[r][j];
       total += dev::shuffle_xor(total, 1);
       total += dev::shuffle_xor(total, 2);
-      const int beside = dev::shuffle_xor(total, 4);  // of the next column
+      const int beside = dev::shuffle_xor(total, 4);  // sum of the next column
       if (lane % 4 == j) first = total, second = beside;
     }
     const int row = row0 + r, column = tile * Int8Tile::kColumns + lane % 4 * 8 + lane / 4;
@@ -229,7 +228,7 @@ VLA_KERNEL(linear_int8_64, 128, 4, LinearInt8Job) { multiply<Bytes64>(job); }
 VLA_KERNEL(linear_ternary_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::ternary>(job); }
 VLA_KERNEL(linear_int8_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::int8>(job); }
 
-/// y of sums over a split depth.
+/// Adds the partial sums of a split and computes y.
 VLA_KERNEL(linear_int8_finish, 128, 4, LinearInt8Job) {
   const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 2;
   if (column >= job.n_column) return;

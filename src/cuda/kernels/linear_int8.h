@@ -6,7 +6,7 @@
 #include "cuda/kernels/launch.h"
 
 /// Products of int8 rows and a matrix of ternary or int8 codes: exact sums, then float(sum) * (scale of the column /
-/// scale of the row) and the epilogue, every operation rounded by itself, as the kernels for CPUs do
+/// scale of the row) and the epilogue. Every operation is rounded separately, as in the kernels for CPUs
 /// (kernels/quantized.h).
 namespace vla::cuda {
 
@@ -29,9 +29,9 @@ struct LinearInt8Job {
   const std::byte* weight;
   const float* scale;  // [n_column]
   std::int64_t x_stride;
-  int n_row, n_column, depth;  // the depth is a multiple of 64
-  /// With more than one split, sums of a share of the depth go to partial [n_column, n_row, n_split], and
-  /// `finish_int8_partial` makes y of them; whole numbers, so the bits stay.
+  int n_row, n_column, depth;  // a multiple of 64
+  /// With more than one split, sums over a share of the depth go to partial [n_column, n_row, n_split];
+  /// `finish_int8_partial` computes y from them. Sums are integers, so the bits stay the same.
   int n_split;
   int* partial;
   Epilogue end;
@@ -41,7 +41,7 @@ enum class CodeKind { ternary, int8 };
 
 /// Bytes of a packed matrix.
 std::size_t packed_int8_size(CodeKind kind, std::int64_t d_in, std::int64_t d_out);
-/// stored: d_out rows of d_in elements as a bundle has them: int8, or ternary in two bits (DType::ternary).
+/// stored: d_out rows of d_in elements as in a bundle: int8, or ternary in two bits (DType::ternary).
 void pack_int8(CodeKind kind, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, std::byte* packed);
 
 /// Rows of a block on tensor cores.
@@ -49,7 +49,7 @@ enum class Int8Shape { few, rows64, rows128 };
 inline Launch linear_int8(CodeKind kind, Int8Shape shape, const LinearInt8Job& job) {
   const bool ternary = kind == CodeKind::ternary;
   const auto splits = static_cast<unsigned>(job.n_split);
-  if (shape == Int8Shape::few)  // four rows and a tile of columns for each of four warps
+  if (shape == Int8Shape::few)  // four rows; a tile of columns for each of four warps
     return {ternary ? "linear_ternary_few" : "linear_int8_few",
             {blocks(job.n_column, 128), blocks(job.n_row, 4), splits},
             128};

@@ -6,7 +6,7 @@
 
 namespace vla::cuda {
 
-/// A thread has four elements, 256 apart, so that a warp's lie side by side.
+/// A thread computes four elements, 256 apart, so that accesses of a warp are coalesced.
 VLA_KERNEL(map_elements, 256, 4, MapJob) {
   const std::int64_t n = job.count();
   for (int k = 0; k < 4; ++k) {
@@ -23,7 +23,7 @@ VLA_KERNEL(map_elements, 256, 4, MapJob) {
     if (job.operation == MapOperation::add) value = dev::add(value, job.b[b]);
     if (job.operation == MapOperation::multiply) value = dev::multiply(value, job.b[b]);
     value = activate(job.activation, value);
-    if (job.factor != 1) value = dev::multiply(value, job.factor);  // a copy keeps any bits
+    if (job.factor != 1) value = dev::multiply(value, job.factor);  // a copy keeps all bits
     store(job.y, job.is_bf16, y, value);
   }
 }

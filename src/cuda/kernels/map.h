@@ -5,8 +5,8 @@
 #include "base/activation.h"
 #include "cuda/kernels/launch.h"
 
-/// Element by element over six dimensions, each operand with steps of its own: additions and products with repeated
-/// dimensions, activations, copies into parts of others, patches of images and the shuffle of pixels.
+/// Elementwise operations over six dimensions, with strides for each operand: broadcast additions and products,
+/// activations, copies into parts of other values, patches of images and pixel shuffle.
 namespace vla::cuda {
 
 enum class MapOperation { copy, add, multiply };
@@ -16,8 +16,8 @@ struct MapJob {
   static constexpr int kDims = 6;
   const float *a, *b;                                        // b is null for a copy
   void* y;                                                   // float32 or bf16
-  int size[kDims];                                           // the fastest first; 1 where there are fewer
-  std::int64_t a_step[kDims], b_step[kDims], y_step[kDims];  // elements; 0 repeats
+  int size[kDims];                                           // fastest first; missing dimensions are 1
+  std::int64_t a_step[kDims], b_step[kDims], y_step[kDims];  // strides in elements; 0 repeats
   float factor;
   MapOperation operation;
   Activation activation;

@@ -22,7 +22,7 @@ void pack_int8(CodeKind kind, const std::byte* stored, std::int64_t d_in, std::i
   for (std::int64_t column0 = 0; column0 < d_out; column0 += Int8Tile::kColumns)
     for (std::int64_t depth0 = 0; depth0 < d_in; depth0 += Int8Tile::kDepth)
       for (int i = 0; i < (ternary ? Int8Tile::kTernaryBytes : Int8Tile::kBytes); ++i, ++packed) {
-        // int8: eight columns, lane, fragment, byte; ternary: lane, eight columns, byte, and all fragments in it.
+        // int8: eight columns, lane, fragment, byte. Ternary: lane, eight columns, byte, with all fragments in a byte.
         const int lane = ternary ? i / 16 : i / 16 % 32, eight = ternary ? i / 4 % 4 : i / 512, byte = i % 4;
         const auto code = [&](int fragment) {
           const std::int64_t n = column0 + 8 * eight + lane / 4, k = depth0 + 16 * fragment + 4 * (lane % 4) + byte;

@@ -8,16 +8,16 @@ namespace vla::cuda {
 namespace {
 
 VLA_DEVICE float sum_of_block(float x, std::byte* room) {
-  __syncthreads();  // the room may still be read
+  __syncthreads();  // earlier values may still be read
   return across_warps(sum_of_warp(x), room, [](float a, float b) { return a + b; });
 }
 
-/// A normed row as codes, to the bit as quantize_row of kernels/quantized.h makes them. `value(i)` is element i.
+/// Writes a normalized row as codes, equal to quantize_row of kernels/quantized.h to the bit. `value(i)` is element i.
 template <class Value>
 VLA_DEVICE void store_codes(std::byte* y, int n, std::byte* room, Value value) {
-  constexpr float kRound = 12582912.0f;  // 1.5 * 2^23: adding it leaves a whole number in the lowest bits, ties to even
+  constexpr float kRound = 12582912.0f;  // 1.5 * 2^23: adding it leaves an integer in the lowest bits, ties to even
   const int n_thread = static_cast<int>(blockDim.x), depth = (n + 63) / 64 * 64;
-  int most = 0;  // without their signs, floats are ordered as whole numbers are, and NaN is above them all
+  int most = 0;  // without their signs, floats order like integers, with NaN above all
   for (int i = thread_index(); i < n; i += n_thread) {
     const int size = dev::bits_of(value(i)) & 0x7fffffff;
     most = size > most ? size : most;
@@ -39,7 +39,7 @@ VLA_DEVICE void store_codes(std::byte* y, int n, std::byte* room, Value value) {
   }
   __syncthreads();
   sum = across_warps(sum_of_warp(sum), room, [](int one, int other) { return one + other; });
-  if (thread_index() < 16) {  // the 64 bytes behind the codes
+  if (thread_index() < 16) {  // the 64 bytes after the codes
     const unsigned word = thread_index() == 0   ? static_cast<unsigned>(dev::bits_of(s))
                           : thread_index() == 1 ? static_cast<unsigned>(sum)
                                                 : 0;
@@ -49,7 +49,7 @@ VLA_DEVICE void store_codes(std::byte* y, int n, std::byte* room, Value value) {
 
 }  // namespace
 
-/// A block has a row, which it keeps in shared memory where it fits.
+/// A block computes one row, which stays in shared memory if it fits.
 VLA_KERNEL(norm_rows, 256, 4, NormJob) {
   std::byte *room = dev::shared_memory(), *row_room = room + 64;
   const std::int64_t row = blockIdx.x;
@@ -77,7 +77,7 @@ VLA_KERNEL(norm_rows, 256, 4, NormJob) {
   }
   __syncthreads();  // a thread reads what others have written
   const auto normed = [&](int i) {
-    float x = dev::multiply(at(i) - mean, factor);  // the same bits wherever it is asked for
+    float x = dev::multiply(at(i) - mean, factor);  // recomputed with the same bits each time
     if (job.weight) x = dev::multiply(x, job.weight[i]);
     return job.bias ? dev::add(x, job.bias[i]) : x;
   };
@@ -87,7 +87,7 @@ VLA_KERNEL(norm_rows, 256, 4, NormJob) {
     store(job.y, job.type == RowType::bf16, row * job.y_stride + i, normed(i));
 }
 
-/// A warp has a row of a head; a lane the pairs (i, i + d_head / 2) of every 32nd i.
+/// A warp computes a row of a head; a lane the pairs (i, i + d_head / 2) of every 32nd i.
 VLA_KERNEL(head_rows, 128, 4, HeadJob) {
   const int lane = thread_index() % kLanes, half = job.d_head / 2;
   const std::int64_t number = static_cast<std::int64_t>(blockIdx.x) * 4 + thread_index() / kLanes;

@@ -4,40 +4,40 @@
 
 #include "cuda/kernels/launch.h"
 
-/// Kernels that take a row at a time: norms, codes, rotations, and lookups in tables.
+/// Kernels that work on one row at a time: norms, codes, rotations and table lookups.
 namespace vla::cuda {
 
 enum class RowNorm { none, layer, rms };
-/// How rows leave: float32, bf16, or int8 codes as kernels/quantized.h lays them out.
+/// Formats of y: float32, bf16, or int8 codes as in kernels/quantized.h.
 enum class RowType { f32, bf16, codes };
 
 /// y = norm(x + residual), row by row.
 struct NormJob {
-  const float* x;              // n_row rows of n values, x_stride elements apart
-  const float* residual;       // n_row rows of n values one after the other, or null
-  float* sum;                  // where x + residual goes, as residual lies, or null
+  const float* x;              // n_row rows of n values with stride x_stride
+  const float* residual;       // n_row contiguous rows of n values, or null
+  float* sum;                  // receives x + residual, in the residual's layout, or null
   const float *weight, *bias;  // [n], or null
-  void* y;                     // y_stride elements from one row to the next; bytes of codes
+  void* y;                     // stride of rows in elements, for codes in bytes
   std::int64_t x_stride, y_stride;
   int n_row, n;
   float eps;
   RowNorm norm;
   RowType type;
 };
-constexpr int kMaxKept = 24576;  // wider rows are read again where narrower ones stay in shared memory
+constexpr int kMaxKept = 24576;  // wider rows are read again; narrower ones stay in shared memory
 inline Launch norm_rows(const NormJob& job) {
   const int n_kept = job.n <= kMaxKept ? job.n : 0;
   return {"norm_rows", {static_cast<unsigned>(job.n_row)}, 256, static_cast<unsigned>(n_kept * 4 + 64)};
 }
 
-/// Rows of heads: an RMS norm over the head where there is a weight, then a rotation of the pairs (x_i, x_{i +
-/// d_head/2}) where there is a table.
+/// Rows of heads: an RMS norm over the head if there is a weight, then a rotation of the pairs (x_i, x_{i + d_head/2})
+/// if there is a table.
 struct HeadJob {
   const float* x;
   void* y;                                // float32 or bf16
   const float* weight;                    // [d_head], or null
-  const float* table;                     // [d_head, n_token]: of a token cosines, then sines; or null
-  std::int64_t x_head, x_token, x_batch;  // elements from one head, token or batch to the next
+  const float* table;                     // [d_head, n_token]: cosines, then sines of each token; or null
+  std::int64_t x_head, x_token, x_batch;  // strides of heads, tokens and batches in elements
   std::int64_t y_head, y_token, y_batch;
   int d_head, n_head, n_token, n_batch;
   float eps;
@@ -48,7 +48,7 @@ inline Launch head_rows(const HeadJob& job) {
 }
 
 enum class TableType { f32, f16, bf16 };
-/// Rows of a table. An id outside of it makes a row of NaN: ids are checked before they come here.
+/// Looks up rows of a table. An id out of range gives a row of NaN; ids are checked before.
 struct LookupJob {
   const void* table;  // n_table rows of n
   const std::int32_t* ids;

@@ -6,18 +6,18 @@
 
 namespace vla::cuda {
 
-/// Row and column of a warp's sums, between which the columns of other rows lie as 16 bytes that keep banks apart.
+/// Byte offset of a warp's sum in shared memory. Rows are padded by 8 elements against bank conflicts.
 template <int kTilesN>
 VLA_DEVICE int sum_place(int row, int column) {
   return (row * (kTilesN * 8 + 8) + column) * 4;
 }
-/// Bytes of shared memory that a warp needs.
+/// Bytes of shared memory per warp.
 template <int kTilesN>
 constexpr int kSumBytes = 16 * (kTilesN * 8 + 8) * 4;
 
-/// Calls store(row, column, first, second) for pairs of a warp's sums, 16 rows after the other, so that lanes side by
-/// side have columns side by side. Passing through shared memory makes what is stored coalesced, and the code of an
-/// epilogue short. `room` is the warp's own; T has 4 bytes.
+/// Calls store(row, column, first, second) for pairs of a warp's sums, 16 rows at a time, with adjacent columns in
+/// adjacent lanes. The sums pass through shared memory, which makes stores coalesced and the epilogue's code short.
+/// `room` belongs to the warp; T has 4 bytes.
 template <int kTilesM, int kTilesN, class T, class Store>
 VLA_DEVICE void store_sums(const T (&sum)[kTilesM][kTilesN][4], std::byte* room, Store store) {
   struct alignas(8) Pair {

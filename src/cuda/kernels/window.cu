@@ -9,7 +9,7 @@
 namespace vla::cuda {
 namespace {
 
-/// A place of the window: the pixel under its upper left corner, which may lie beyond the image.
+/// A place of the window: the pixel at its upper left corner, which may be outside of the image.
 struct Place {
   const float* image;
   int column, row;
@@ -22,7 +22,7 @@ VLA_DEVICE Place place_of(const WindowJob& job, std::int64_t number) {
           static_cast<int>(number / job.n_column % job.n_row) * job.stride - job.padding};
 }
 
-/// Feature i of a pixel, `beyond` where the image has none.
+/// Feature i of a pixel, or `beyond` outside of the image.
 VLA_DEVICE float feature(const WindowJob& job, const float* image, int column, int row, int i, float beyond) {
   if (column < 0 || column >= job.width || row < 0 || row >= job.height) return beyond;
   return image[(static_cast<std::int64_t>(row) * job.width + column) * job.d + i];
@@ -38,7 +38,7 @@ VLA_DEVICE float largest(const WindowJob& job, const Place& place, int i) {
   return most;
 }
 
-/// Times the feature's weights, in the order of the window's pixels.
+/// Sums products with the feature's weights in the order of the window's pixels.
 VLA_DEVICE float weighted(const WindowJob& job, const Place& place, int i) {
   float sum = job.bias[i];
   for (int pixel = 0; pixel < job.size * job.size; ++pixel) {
@@ -50,7 +50,7 @@ VLA_DEVICE float weighted(const WindowJob& job, const Place& place, int i) {
 
 }  // namespace
 
-/// A thread has four elements, 256 apart, so that a warp's lie side by side.
+/// A thread computes four elements, 256 apart, so that accesses of a warp are coalesced.
 VLA_KERNEL(window_elements, 256, 4, WindowJob) {
   const std::int64_t n = job.count(), n_of_row = job.n_of_row();
   for (int k = 0; k < 4; ++k) {

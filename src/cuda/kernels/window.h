@@ -4,18 +4,18 @@
 
 #include "cuda/kernels/launch.h"
 
-/// A window that moves over images (op::Window): it gives rows for the product that makes a convolution of them, or of
-/// each feature the largest, or a weighted sum.
+/// A window that moves over images (op::Window). It writes unfolded rows for a convolution's product, or for each
+/// feature the maximum or a weighted sum.
 namespace vla::cuda {
 
 struct WindowJob {
   const float* x;              // [d, width, height, n_view]
   const float *weight, *bias;  // [d, size * size], [d], or null
-  void* y;  // a row for each place: d * size * size elements, or d of the largest or of the sums; float32 or bf16
-  std::int64_t y_stride;  // elements from one row to the next
+  void* y;                     // one row per place: d * size * size elements, or d for maxima and sums; float32 or bf16
+  std::int64_t y_stride;       // stride of rows in elements
   int d, width, height, n_view;
   int size, stride, padding;
-  int n_column, n_row;  // places of an image
+  int n_column, n_row;  // places per image
   bool takes_largest, is_bf16;
 
   VLA_HOST_DEVICE std::int64_t n_of_row() const {
