@@ -10,7 +10,7 @@
 namespace vla::cli {
 namespace {
 
-/// The bytes that a unit stands for, 0 where there is no such unit.
+/// The number of bytes in a unit; 0 for an unknown unit.
 double unit_size(std::string_view unit) {
   constexpr std::string_view kLetters = "BKMGT";
   if (unit.empty()) return 1;

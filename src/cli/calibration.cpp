@@ -8,7 +8,7 @@
 namespace vla::cli {
 namespace {
 
-/// The act of a record that was answered with a chunk, with the seed of the answer; none for other records.
+/// The act of a record that was answered with a chunk, with the answer's seed; none for other records.
 std::optional<v1::Act> answered_act(const serve::Recording::Record& record) {
   v1::Request request;
   v1::Response response;

@@ -6,8 +6,8 @@
 
 namespace vla::cli {
 
-/// At most so many acts of a recording that were answered with a chunk, evenly spread, each with the noise that it had.
-/// Errors: those of Recording; those of Bundle::open and the policy; bad_request for a recording of another policy.
+/// Reads up to that many acts of a recording that were answered with a chunk, evenly spread, each with its noise.
+/// Errors: those of Recording, Bundle::open and the policy; bad_request for a recording of another policy.
 Result<std::vector<Judged>> read_observations(const std::string& recording, const std::string& bundle,
                                               std::size_t n_most);
 

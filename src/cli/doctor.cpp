@@ -66,7 +66,8 @@ void print_policy(const bench::Checkup& c) {
     say(stdout, "rate      the bundle states none; {:.3g} chunks a second\n", 1e3 / c.best());
 }
 
-/// Prints the settings that matter most. Peaks tell what other kernels could gain; their cost is the user's to measure.
+/// Prints the settings that matter most. The peaks show what other kernels could gain; what they cost in accuracy is
+/// for the user to measure.
 void print_settings(const bench::Checkup& c, const bench::Machine& machine) {
   if (!c.report.conditions.on_cpu()) return;
   const int n_thread = c.report.conditions.n_thread;

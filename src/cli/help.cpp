@@ -26,7 +26,7 @@ std::string wrap(const std::string& text, std::size_t width) {
   return wrapped + line;
 }
 
-/// CLI11 says `INT:INT in [0 - 512]`, `TEXT:{text,json}`, `TEXT:FILE`: kind, then what is accepted.
+/// CLI11 prints `INT:INT in [0 - 512]`, `TEXT:{text,json}` or `TEXT:FILE`: the kind, then the accepted values.
 struct Accepted {
   std::string kind, range, choices;
 

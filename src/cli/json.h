@@ -8,17 +8,16 @@
 
 namespace vla::cli {
 
-/// JSON with members in the order of insertion and floats in their shortest form that reads back to the same float32.
+/// JSON with members in insertion order and floats in the shortest form that reads back to the same float32.
 using Json =
     nlohmann::basic_json<nlohmann::ordered_map, std::vector, std::string, bool, std::int64_t, std::uint64_t, float>;
 
-/// One line, or indented lines. Bytes that are not UTF-8, as a path may have them, become U+FFFD: JSON cannot hold
-/// them.
+/// Prints one line, or indented lines. Bytes that are not UTF-8, which a path may have, become U+FFFD.
 inline std::string text_of(const Json& json, int indent = -1) {
   return json.dump(indent, ' ', true, Json::error_handler_t::replace);
 }
 
-/// Which bundle answered: path, architecture, dtype, source and checksum.
+/// Identifies the bundle: path, architecture, dtype, source and checksum.
 inline Json identity_json(const Bundle& bundle) {
   Json identity;
   identity["path"] = bundle.path();

@@ -1,7 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-//
-// The texts of --help as a man page and as bash completions: both are made from the commands themselves.
+// Prints --help as a man page and as bash completions, from the commands themselves.
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
@@ -18,7 +17,7 @@ std::vector<const CLI::App*> commands_of(const CLI::App& app) {
   return app.get_subcommands([](const CLI::App*) { return true; });
 }
 
-/// As roff takes it: a hyphen that can be copied, no escapes, and no line that starts as a request.
+/// Escapes a text for roff: hyphens that can be copied, no escapes, and no line that starts with a request.
 std::string roff(const std::string& text) {
   std::string out;
   for (const char c : text) {
@@ -44,7 +43,7 @@ std::string roff_options(const CLI::App& command) {
   return text;
 }
 
-/// A footer's lines as they stand.
+/// Keeps a footer's lines as they are.
 std::string roff_lines(const std::string& text) {
   return text.empty() ? "" : fmt::format(".PP\n.nf\n{}\n.fi\n", roff(text));
 }

@@ -13,7 +13,7 @@
 
 namespace vla::cli {
 
-/// An argument as it may be shown: texts come from bundles, recordings and servers, and must not act on a terminal.
+/// An argument escaped for display: texts come from bundles, recordings and servers, and must not act on a terminal.
 template <class T>
 decltype(auto) shown(const T& value) {
   if constexpr (std::is_convertible_v<const T&, std::string_view>) {
@@ -23,18 +23,19 @@ decltype(auto) shown(const T& value) {
   }
 }
 
-/// Writes text as it is. Throws std::system_error where standard output cannot be written. Where standard error cannot,
-/// nobody is there to be told, and the exit code says what happened.
+/// Writes text unchanged. Throws std::system_error if standard output cannot be written. Failures on standard error are
+/// ignored; the exit code tells what happened.
 void put(std::FILE* to, std::string_view text);
 
-/// The way to standard output and standard error. Line ends of the format are kept, those in arguments are not.
+/// Formatted output to standard output and standard error. Line ends in the format stay; those in arguments are
+/// escaped.
 template <class... Args>
 void say(std::FILE* to, fmt::format_string<decltype(shown(std::declval<const Args&>()))...> format,
          const Args&... args) {
   put(to, fmt::format(format, shown(args)...));
 }
 
-/// The same for a text of several lines that was put together here.
+/// The same for a text of several lines that the program composed.
 void say_lines(std::FILE* to, std::string_view text);
 
 }  // namespace vla::cli

@@ -34,13 +34,13 @@ constexpr std::size_t kMaxHeader = 4096;
 constexpr const char* kPolicy =
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; img-src blob:; "
     "frame-ancestors 'none'";
-constexpr auto kPatience = std::chrono::seconds(2);  // from the connection to the last byte of its answer
+constexpr auto kPatience = std::chrono::seconds(2);  // from accepting the connection to the last byte of the answer
 
 struct Handlers {
   HttpHandler get, post;
 };
 
-/// One request and its answer. Whoever holds the shared pointer last, the pending operation as a rule, closes it.
+/// One request and its answer. The last owner of the shared pointer, usually the pending operation, closes it.
 class Connection : public std::enable_shared_from_this<Connection> {
  public:
   Connection(tcp::socket socket, const Handlers& handlers) : stream_(std::move(socket)), handlers_(handlers) {
@@ -69,7 +69,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     response_.set(http::field::content_type, reply.type);
     response_.set(http::field::cache_control, "no-store");
     response_.set("X-Content-Type-Options", "nosniff");
-    response_.set("Referrer-Policy", "no-referrer");  // a token in the address stays here
+    response_.set("Referrer-Policy", "no-referrer");  // does not log a token in the address
     response_.set("Content-Security-Policy", kPolicy);
     response_.keep_alive(false);
     response_.body() = std::move(reply.body);
@@ -112,7 +112,7 @@ class Http::Server {
   const std::string& address() const { return address_; }
 
  private:
-  /// Whatever a library throws costs the connection that it happened to.
+  /// An exception of a library ends only the connection in which it occurred.
   void run() noexcept {
     while (!context_.stopped()) {
       try {

@@ -16,22 +16,22 @@ struct HttpReply {
   std::string body;
 };
 
-/// The answer to GET of a path, or to POST; `query` is what follows its question mark. A body is not read.
+/// Answers GET or POST of a path; `query` is the part after the question mark. Bodies are not read.
 using HttpHandler = std::function<HttpReply(const std::string& path, const std::string& query)>;
 
-/// HTTP for those who watch the server. One thread serves all connections and waits for none of them. A connection has
-/// a time to ask and take its answer, and the oldest one makes room where there are too many, so that a slow or broken
-/// client blocks no other.
+/// The HTTP server for monitoring. One thread serves all connections and blocks on none. A connection must ask and read
+/// its answer within a time limit, and the oldest one is closed if there are too many, so a slow or broken client
+/// delays no other.
 class Http {
  public:
-  /// Listens at once, at HOST:PORT, HOST an IPv4 address, an IPv6 address in brackets, or `*`. An address that others
-  /// can reach needs `insecure`: HTTP has no keys. The handlers are called on the thread of Http; without one for POST
-  /// that is refused. `option`: where errors are. Errors: usage, io, out_of_memory.
+  /// Listens at HOST:PORT. HOST is an IPv4 address, an IPv6 address in brackets, or `*`. An address that other hosts
+  /// can reach needs `insecure`, since HTTP has no keys. Handlers run on the thread of Http; without a handler POST is
+  /// refused. `option`: the place in errors. Errors: usage, io, out_of_memory.
   static Result<std::unique_ptr<Http>> open(const std::string& address, const char* option, bool insecure,
                                             HttpHandler get, HttpHandler post = {});
   ~Http();
 
-  /// The bound address, the port filled in.
+  /// The bound address with its port.
   const std::string& address() const;
 
  private:

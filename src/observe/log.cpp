@@ -15,7 +15,7 @@ namespace {
 constexpr std::size_t kMaxLogBacklog = 1 << 20;
 constexpr auto kNoteAgain = std::chrono::minutes(1);
 constexpr std::size_t kMaxNoted = 1024;
-constexpr double kBurst = 200, kPerSecond = 50;  // lines about clients
+constexpr double kBurst = 200, kPerSecond = 50;  // limit of lines about clients
 
 std::string now() {
   const auto time = std::chrono::system_clock::now();
@@ -27,7 +27,7 @@ std::string now() {
                      utc.tm_hour, utc.tm_min, utc.tm_sec, ms);
 }
 
-/// A word as it is, anything else in quotes.
+/// Quotes everything except a single word.
 std::string plain(const std::string& json) {
   const auto is_plain = [](unsigned char c) {
     return std::isalnum(c) != 0 || c == '.' || c == '_' || c == '-' || c == ':' || c == '/' || c == '[' || c == ']' ||
@@ -64,7 +64,7 @@ double ms(Clock::duration time) { return std::chrono::duration<double, std::mill
 Log::Log(int fd, LogFormat format, Level min_level)
     : format_(format), min_level_(min_level), writer_(fd, Writer::Owns::no, kMaxLogBacklog), allowance_(kBurst) {}
 
-/// Whoever is refused can ask again at once: its lines must not fill the disk.
+/// A refused client can ask again at once, so its lines are limited: they must not fill the disk.
 bool Log::may_tell() {
   if (min_level_ == Level::debug) return true;
   const Clock::time_point at = Clock::now();
@@ -78,7 +78,7 @@ bool Log::may_tell() {
   try {
     if (n_left_out_ > 0) event(Level::warn, "log_limited", {{"lines", n_left_out_}});
     n_left_out_ = 0;
-  } catch (const std::exception&) {  // no memory: the next line tells it
+  } catch (const std::exception&) {  // no memory: the next line reports it
   }
   return true;
 }
@@ -105,14 +105,14 @@ void Log::event(Level level, const char* name, const Fields& fields) noexcept {
   try {
     const std::uint64_t dropped = writer_.n_dropped();
     std::uint64_t told = n_told_;
-    if (dropped > told && n_told_.compare_exchange_strong(told, dropped))  // another thread may tell it, or more
+    if (dropped > told && n_told_.compare_exchange_strong(told, dropped))  // another thread may report it, or more
       writer_.put(line(Level::warn, "log_dropped", {{"lines", dropped - told}}));
     writer_.put(line(level, name, fields));
-  } catch (const std::exception&) {  // no memory for a line: the server goes on without it
+  } catch (const std::exception&) {  // no memory for a line: it is dropped
   }
 }
 
-/// Notes of a kind begin alike: the values that differ from act to act stand behind a colon or a bracket.
+/// The part of a note that is the same for each act: values that change come after a colon or a bracket.
 bool Log::is_news(const std::string& client, const std::string& note) {
   const Clock::time_point at = Clock::now();
   if (noted_.size() >= kMaxNoted) noted_.clear();
@@ -166,7 +166,7 @@ void Log::answered(const Answered& answered) {
   }
 }
 
-/// A peer without a key or without ZMTP is a warning; a peer that fell silent is normal.
+/// A peer without a key or without ZMTP is a warning; a peer that went silent is normal.
 void Log::dropped(const Dropped& connection) {
   const Level level = connection.why == "silent" ? Level::info : Level::warn;
   if (level < min_level_ || !may_tell()) return;

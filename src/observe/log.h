@@ -15,12 +15,12 @@ constexpr const char* kLevelNames[] = {"debug", "info", "warn", "error"};
 
 enum class LogFormat { text, json };
 
-/// Events, one in a line: JSON objects with `time` (UTC), `level`, `event` and the fields of the event, or the same
-/// as text for people. What a client sends is escaped inside its field. docs/serving.md lists events and fields.
+/// Writes events, one per line: JSON objects with `time` (UTC), `level`, `event` and the event's fields, or the same as
+/// text. Clients' values are escaped. docs/serving.md lists events and fields.
 class Log final : public Observer {
  public:
-  /// A name of our own, and a value as JSON of ASCII characters: a terminal must not obey what a client sends. Kept as
-  /// text, because the library's objects take memory even to be destroyed, and end the process where there is none.
+  /// A field: a name of ours, and its value as ASCII JSON, so that a client's text cannot act on a terminal. It is
+  /// stored as text, because the JSON library allocates memory even to destroy its objects.
   struct Field {
     template <class Value>
     Field(const char* its_name, const Value& value)
@@ -28,16 +28,15 @@ class Log final : public Observer {
     std::string name, json;
   };
   using Fields = std::vector<Field>;
-  /// Writes events of at least `min_level` to `fd`, which stays open.
+  /// Writes events of `min_level` and above to `fd`, which stays open.
   Log(int fd, LogFormat format, Level min_level);
   ~Log() override;
 
   /// From any thread.
   void event(Level level, const char* name, const Fields& fields) noexcept;
-  /// A request: at level debug where it was answered as requested, info where the queue refused it, warn
-  /// where the request was wrong, error where the server failed. A chunk's notes are warnings, each told once a minute
-  /// for a client and what it is about. At levels above debug, clients and peers cause at
-  /// most 200 lines at once and 50 a second; a line `log_limited` counts the others.
+  /// Logs a request: debug if it was answered, info if the queue refused it, warn if the request was wrong, error if
+  /// the server failed. Notes of a chunk are warnings, logged once a minute per client and kind. Above debug, clients
+  /// and peers cause at most 200 lines at once and 50 a second; a line `log_limited` counts the rest.
   void answered(const Answered& answered) override;
   void dropped(const Dropped& connection) override;
 
@@ -50,11 +49,11 @@ class Log final : public Observer {
   LogFormat format_;
   Level min_level_;
   Writer writer_;
-  std::atomic<std::uint64_t> n_told_ = 0;  // of the lines that were dropped
-  // Of the I/O thread: lines about clients that may be written now, and those that were left out.
+  std::atomic<std::uint64_t> n_told_ = 0;  // count of dropped lines
+  // For the I/O thread: how many lines about clients may be written now, and how many were left out.
   double allowance_;
   std::uint64_t n_left_out_ = 0;
-  std::map<std::string, Clock::time_point> noted_;  // by client and the beginning of the note, when it was told
+  std::map<std::string, Clock::time_point> noted_;  // when a note was last logged, by client and kind
   Clock::time_point told_at_ = Clock::now();
 };
 

@@ -103,11 +103,11 @@ void Metrics::received(const Received& request) {
   if (request.is_first) clients_.Increment();
 }
 
-/// `why` is one of a few words of the server's own.
+/// `why` is one of a fixed list of words.
 void Metrics::dropped(const Dropped& connection) try {
   if (connection.why == "key") refused_.Increment();
   dropped_.Add({{"why", connection.why}}).Increment();
-} catch (const std::bad_alloc&) {  // uncounted: the server goes on
+} catch (const std::bad_alloc&) {  // not counted; the server continues
 }
 
 void Metrics::answered(const Answered& answered) try {

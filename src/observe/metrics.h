@@ -17,16 +17,16 @@
 
 namespace vla::serve {
 
-/// Counts and times requests for Prometheus. docs/serving.md lists the metrics. Labels take their values from the
-/// server, never from a client, so that their number is bounded.
+/// Counts and times requests for Prometheus. docs/serving.md lists the metrics. Label values come from the server,
+/// never from a client, so their number is bounded.
 class Metrics final : public Observer {
  public:
   Metrics();
 
-  /// A policy that answers from now on, instead of one of the same name. From any thread, as `forget`.
+  /// Adds a policy, replacing one of the same name. Any thread may call this and `forget`.
   void describe(const v1::Description& description, const MemoryUse& memory);
   void forget(const std::string& policy);
-  /// Text of the exposition format 0.0.4, from any thread. Resident memory is read now.
+  /// The metrics in exposition format 0.0.4. Reads resident memory now. Any thread may call it.
   std::string text(const Health& health) const;
 
   void received(const Received& request) override;

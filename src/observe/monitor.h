@@ -6,15 +6,15 @@
 
 namespace vla::serve {
 
-/// HTTP for programs that watch the server: `/metrics`, `/healthz` (200 while the process lives) and `/readyz` (200
-/// while acts are taken, else 503 and why not).
+/// HTTP for monitoring programs: `/metrics`, `/healthz` (200 while the process lives) and `/readyz` (200 while acts are
+/// taken, else 503 with the reason).
 class Monitor {
  public:
   struct Sources {
-    std::function<std::string()> metrics;           // text of the exposition format
-    std::function<std::string()> not_ready_reason;  // why no act is taken; empty: they are
+    std::function<std::string()> metrics;  // text in exposition format
+    std::function<std::string()> not_ready_reason;  // why no acts are taken; empty if they are
   };
-  /// As Http::open; the functions are called on the thread of Http.
+  /// As Http::open. The functions are called on Http's thread.
   static Result<std::unique_ptr<Monitor>> open(const std::string& address, bool insecure, Sources sources);
 
   const std::string& address() const { return http_->address(); }

@@ -22,23 +22,23 @@ namespace vla::serve {
 /// answer. Times are the system's when the file was opened, counted on by a clock that nobody sets.
 constexpr const char* kRecordingFile = "requests.vlarec";
 
-/// Records what a server answers, up to a size.
+/// Records requests and answers, up to a size.
 class Recorder final : public Observer {
  public:
-  /// Makes the folder where there is none. A folder that has a recording is refused. Errors: io.
+  /// Creates the folder if it is missing. A folder with a recording is refused. Errors: io.
   static Result<std::unique_ptr<Recorder>> open(const std::string& folder, std::uint64_t max_bytes);
   ~Recorder() override;
 
-  /// Who answers; before the first request.
+  /// Describes the server. Call it before the first request.
   void describe(const v1::Description& description);
   void answered(const Answered& answered) override;
   bool records() const override { return true; }
   std::uint64_t n_recorded() const { return n_record_ == 0 ? 0 : n_record_ - 1; }
   std::uint64_t n_byte() const { return bytes_; }
-  const std::string& why_stopped() const { return why_stopped_; }  // empty: it has not
+  const std::string& why_stopped() const { return why_stopped_; }  // why it stopped; empty if it did not
 
-  /// Called once, when it stops before the server does: at the limit, or when the disk fails or is too slow. From then
-  /// on nothing is recorded, so that a recording has no holes.
+  /// Called once if recording stops before the server does: at the limit, or if the disk fails or is too slow. Nothing
+  /// is recorded afterwards, so a recording has no holes.
   void on_stop(std::function<void(const std::string& why, std::uint64_t n_recorded)> tell) { tell_ = std::move(tell); }
 
  private:
@@ -51,7 +51,7 @@ class Recorder final : public Observer {
 
   const std::string path_;
   const std::uint64_t max_bytes_;
-  const std::chrono::nanoseconds epoch_;  // of the steady clock, since 1970
+  const std::chrono::nanoseconds epoch_;  // difference of the system clock (since 1970) and the steady clock
   std::uint64_t bytes_ = 0;
   std::uint32_t n_record_ = 0;
   std::string why_stopped_;
@@ -59,22 +59,22 @@ class Recorder final : public Observer {
   Writer writer_;
 };
 
-/// Reads a recording, record by record. Every size is compared with the file before memory is taken.
+/// Reads a recording, record by record. Every size is compared with the file before memory is allocated.
 class Recording {
  public:
   struct Record {
     std::size_t index = 0;  // from 1
     std::string request, response;
-    std::uint64_t client = 0;  // tells connections apart
-    std::uint64_t at_ns = 0;   // when the request came, since 1970
+    std::uint64_t client = 0;  // identifies the connection
+    std::uint64_t at_ns = 0;  // arrival of the request, since 1970
   };
-  /// Errors: io, bad_request (not a recording, damaged, cut off).
+  /// Errors: io, bad_request (not a recording, damaged, truncated).
   static Result<Recording> open(const std::string& folder);
 
   const v1::Description& description() const { return description_; }
-  /// None at the end. Errors: bad_request, with the record and its place in the file.
+  /// The next record; none at the end. Errors: bad_request, with the record and its place in the file.
   Result<std::optional<Record>> next();
-  /// Whether the end that was reached is the one that the server wrote: a server that was killed writes none.
+  /// Whether the server wrote an end record. A killed server writes none.
   bool is_whole() const { return is_whole_; }
 
  private:

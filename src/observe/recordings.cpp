@@ -13,7 +13,7 @@ namespace {
 
 Error refused(const char* expected, const char* found) { return {Code::usage, "recording", expected, found}; }
 
-/// A name that sorts by time, in UTC, to the microsecond: two recordings never begin in the same.
+/// A file name from the UTC time in microseconds, so that names sort by time and do not repeat.
 std::string name_of_now() {
   const auto now = std::chrono::system_clock::now();
   const auto us = std::chrono::duration_cast<std::chrono::microseconds>(now.time_since_epoch()).count() % 1'000'000;
@@ -58,7 +58,7 @@ Status Recordings::end() {
 
 Status Recordings::begin_in(const std::string& folder) {
   VLA_TRY(std::unique_ptr<Recorder> recorder, Recorder::open(folder, max_bytes_ - std::min(max_bytes_, last_.bytes)));
-  recorder->on_stop([this](const std::string&, std::uint64_t) {  // under the lock, as whatever the recorder is told
+  recorder->on_stop([this](const std::string&, std::uint64_t) {  // under the lock, like every call of the recorder
     if (tell_) tell_(now());
   });
   const std::lock_guard lock(mutex_);
@@ -68,7 +68,7 @@ Status Recordings::begin_in(const std::string& folder) {
   return {};
 }
 
-/// What waits for the disk is written without the lock, for which requests would wait.
+/// Flushes to disk without the lock, so that requests do not wait for it.
 void Recordings::close() {
   std::unique_ptr<Recorder> closed;  // after the lock
   const std::lock_guard lock(mutex_);

@@ -12,29 +12,29 @@
 
 namespace vla::serve {
 
-/// The recordings of a server, one at a time, so that each is whole: one in the folder itself from the start, where
-/// that is asked for, and one in a folder below, named by its time, whenever people begin another. From any thread.
+/// A server's recordings, one at a time: optionally one in the folder itself from the start, and one in a subfolder
+/// named by its time whenever a person starts another. Any thread may call.
 class Recordings final : public Observer {
  public:
-  /// Of the recording that runs, or of the last one.
+  /// State of the current recording, or of the last one.
   struct Standing {
     bool on = false;
-    std::string folder;           // empty where there was none yet
+    std::string folder;  // empty before the first one
     std::uint64_t n_request = 0;  // in it
-    std::uint64_t bytes = 0;      // of all recordings together
-    std::string why;              // it ended before people ended it; else empty
+    std::uint64_t bytes = 0;  // bytes of all recordings
+    std::string why;  // why it ended by itself; else empty
   };
 
-  /// `max_bytes`: of all recordings together.
+  /// `max_bytes`: limit of all recordings together.
   Recordings(std::string folder, std::uint64_t max_bytes) : folder_(std::move(folder)), max_bytes_(max_bytes) {}
 
-  /// Begins the one in the folder itself. Errors: io.
+  /// Starts the recording in the folder itself. Errors: io.
   Status open();
-  /// Who answers; before the first request.
+  /// Describes the server. Call it before the first request.
   void describe(const v1::Description& description);
-  /// Begins one in a folder below. Errors: usage (one runs; no policy is loaded yet), io.
+  /// Starts one in a subfolder. Errors: usage (one is running, or no policy is loaded yet), io.
   Status begin();
-  /// Ends the one that runs; its bytes are in the file then. Errors: usage where none runs.
+  /// Ends the running one; then its bytes are in the file. Errors: usage if none is running.
   Status end();
 
   void answered(const Answered& answered) override;
@@ -42,7 +42,7 @@ class Recordings final : public Observer {
   Standing standing() const;
   std::uint64_t max_bytes() const { return max_bytes_; }
 
-  /// Called where one begins or ends after `open`; it must not call back.
+  /// Called when a recording starts or ends after `open`; it must not call back.
   void on_change(std::function<void(const Standing&)> tell) { tell_ = std::move(tell); }
 
  private:
@@ -53,11 +53,11 @@ class Recordings final : public Observer {
   const std::string folder_;
   const std::uint64_t max_bytes_;
   std::function<void(const Standing&)> tell_;
-  std::mutex changing_;       // of who begins or ends a recording, and may wait for a disk
-  mutable std::mutex mutex_;  // of the rest, never for long
+  std::mutex changing_;  // held while a recording starts or ends, which may wait for a disk
+  mutable std::mutex mutex_;  // guards the rest, held briefly
   std::optional<v1::Description> description_;
-  std::unique_ptr<Recorder> recorder_;  // one that ended by itself too, until people end it or begin another
-  Standing last_;                       // of recordings that are closed; its bytes are of all of those
+  std::unique_ptr<Recorder> recorder_;  // kept after it ended by itself, until a person ends it or starts another
+  Standing last_;  // bytes of closed recordings
 };
 
 }  // namespace vla::serve
