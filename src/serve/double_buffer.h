@@ -10,27 +10,27 @@
 
 namespace vla::serve {
 
-/// Two acts that take turns: one thread prepares one of them while another thread computes the other.
+/// Two acts in alternation: one thread prepares one of them while another computes the other.
 template <class Act>
 class DoubleBuffer {
  public:
   explicit DoubleBuffer(std::array<Act, 2> acts = {}) : acts_(std::move(acts)) {}
 
-  /// The act to prepare next, once its last turn is over; `prepared` hands it over.
+  /// Waits for a free act to prepare; `prepared` hands it over.
   Act& to_prepare() {
     std::unique_lock lock(mutex_);
     changed_.wait(lock, [this] { return n_prepared_ - n_computed_ < acts_.size(); });
     return acts_[n_prepared_ % acts_.size()];
   }
   void prepared() { count(n_prepared_); }
-  /// No act is prepared any more.
+  /// Ends: no act is prepared afterwards.
   void close() {
     const std::lock_guard lock(mutex_);
     closed_ = true;
     changed_.notify_all();
   }
 
-  /// The act to compute next, once it is prepared; `computed` gives it back. Null where none comes any more.
+  /// Waits for a prepared act to compute; `computed` returns it. Null after the end.
   Act* to_compute() {
     std::unique_lock lock(mutex_);
     changed_.wait(lock, [this] { return n_prepared_ > n_computed_ || closed_; });

@@ -19,9 +19,9 @@ Exchange::~Exchange() {
 }
 
 void Exchange::wake() const noexcept {
-  const int saved = errno;  // a signal handler must leave it as it was
+  const int saved = errno;  // a signal handler must keep errno
   const std::uint64_t one = 1;
-  [[maybe_unused]] const auto written = ::write(fd_, &one, sizeof(one));  // fails only where it is signalled already
+  [[maybe_unused]] const auto written = ::write(fd_, &one, sizeof(one));  // fails only if it is already signalled
   errno = saved;
 }
 
@@ -31,7 +31,7 @@ std::optional<Job> Exchange::next() {
     const auto deadline = jobs_.first_deadline();
     const bool has_late = deadline && *deadline <= now_();
     if (has_late) {
-      wake();  // the I/O thread takes it out and comes back
+      wake();  // the I/O thread drains it and returns
     } else if (!jobs_.empty() && !(jobs_.is_crowded() && n_taken_ > 0)) {
       ++n_taken_;
       return jobs_.pop();

@@ -21,8 +21,8 @@ class Io;
 /// The answer of the engine to an act.
 struct Reply {
   const ActRequest& request;
-  ActionChunk chunk;  // `timing` has the server's own stages in it
-  double queue_ms;    // that the act waited
+  ActionChunk chunk;  // `timing` includes the server's stages
+  double queue_ms;  // time that the act waited
 };
 
 /// An act and its answer as serialized v1::Request and v1::Response.
@@ -30,51 +30,51 @@ struct Record {
   std::string request, response;
 };
 
-/// One request of a client, in the protocol of its front end: how it is decoded and answered. One thread at a time.
+/// One request of a client in its protocol: decodes it and encodes its answer. One thread at a time uses it.
 class Call {
  public:
   virtual ~Call() = default;
-  /// The act that it is, with its images decoded. On the thread that prepares. Errors: bad_request, too_large,
-  /// bad_observation.
+  /// Decodes the act with its images. On the preparing thread. Errors: bad_request, too_large, bad_observation.
   virtual Result<ActRequest> decode(const ServedPolicy& policy) = 0;
-  /// The chunk's bytes. On the thread that computes.
+  /// Encodes the chunk. On the computing thread.
   virtual std::string encode(Reply reply, const ServedPolicy& policy) = 0;
-  /// The refusal's bytes. On the I/O thread, as what follows.
+  /// Encodes a refusal. This and what follows run on the I/O thread.
   virtual std::string encode(const Error& error) = 0;
-  /// Hands an answer to the socket. A client that is gone, or that does not read, does not get it.
+  /// Sends an answer, unless the client is gone or does not read.
   virtual void send(const std::string& answer) = 0;
-  /// Frees what it holds, and tells the client that there is no memory for its answer, if there is any for that.
+  /// Frees its memory, and reports to the client that memory ran out, if that is possible.
   virtual void send_out_of_memory() noexcept = 0;
-  /// The request where it is a serialized v1::Request; null in other protocols.
+  /// The request, if it is a serialized v1::Request; null in other protocols.
   virtual const net::Bytes* native() const { return nullptr; }
 };
 
 /// A request on its way through the server.
 struct Job : Received {
   std::unique_ptr<Call> call;
-  std::string policy_name;                   // as the client gives it; empty for the only one or the default
-  std::shared_ptr<ServedPolicy> policy;      // that answers, once it is in line
-  net::Share share;                          // whose turn it is
-  std::optional<std::uint64_t> deadline_ms;  // from its receipt: when its turn has to have come
+  std::string policy_name;  // name that the client gave; empty for the only policy or the default
+  std::shared_ptr<ServedPolicy> policy;  // the policy that answers, once it is queued
+  net::Share share;  // for fairness between peers
+  std::optional<std::uint64_t> deadline_ms;  // from receipt until it must be started
   std::optional<Clock::time_point> deadline;
 };
 
-/// A protocol: the sockets that it listens at, what it answers itself, and the calls that it hands to `Io::submit`. It
-/// knows no architecture; what a policy takes is in the description.
+/// A protocol: it owns its listening sockets, answers what needs no engine, and passes calls to `Io::submit`. It knows
+/// no architecture; the description says what a policy takes.
 class Front {
  public:
   virtual ~Front() = default;
-  /// The bound addresses, ports filled in.
+  /// The bound addresses with their ports.
   virtual std::vector<std::string> addresses() const = 0;
-  /// The policy of acts that name none, before `begin`. Errors: usage where the protocol cannot carry what it takes.
+  /// Sets the policy for acts that name none; call it before `begin`. Errors: usage, if the protocol cannot carry the
+  /// policy's inputs.
   virtual Status serve(const ServedPolicy& policy) = 0;
-  /// Another version took its place: it differs in nothing but bundle and runtime. On the I/O thread.
+  /// Another version replaced the policy; only bundle and runtime differ. On the I/O thread.
   virtual void replaced(const v1::Description&) {}
-  /// The names that its clients give, and their conventions, for people; empty where they are the policy's own.
+  /// The names that clients send, and their conventions, as a text for people; empty if they are the policy's own.
   virtual std::string told() const { return {}; }
-  /// Takes connections from now on; called before every turn of the loop.
+  /// Accepts connections from now on; called before every turn of the loop.
   virtual void begin(Io& io) = 0;
-  /// Whether an answer has not left yet.
+  /// Whether an answer is not sent yet.
   virtual bool has_answers() const = 0;
 };
 

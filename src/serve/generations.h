@@ -10,16 +10,16 @@
 
 namespace vla::serve {
 
-/// Connections that came together, told by when they came: these times are cut where the gap between two of them is a
-/// second or more, at the widest where there are many. A flood that is to be of a robot's generation has to leave as
-/// many gaps as wide as that between the robot and itself.
+/// Splits connections into generations by their time of arrival: at gaps of a second or more, the widest ones if there
+/// are many. To share a robot's generation, a flood needs as many other gaps as wide as the one between the robot and
+/// itself.
 class Generations {
  public:
   static constexpr std::size_t kMax = 8;
 
   explicit Generations(std::vector<Clock::time_point> times) {
     std::sort(times.begin(), times.end());
-    std::vector<std::pair<Clock::duration, Clock::time_point>> gaps;  // and what came after
+    std::vector<std::pair<Clock::duration, Clock::time_point>> gaps;  // gaps, and the arrival after each
     for (std::size_t i = 1; i < times.size(); ++i)
       if (const auto gap = times[i] - times[i - 1]; gap >= std::chrono::seconds(1)) gaps.emplace_back(gap, times[i]);
     std::sort(gaps.rbegin(), gaps.rend());
@@ -35,7 +35,7 @@ class Generations {
   }
 
  private:
-  std::vector<Clock::time_point> starts_;  // of all but the oldest
+  std::vector<Clock::time_point> starts_;  // first arrivals of all generations except the oldest
 };
 
 }  // namespace vla::serve

@@ -14,12 +14,13 @@
 
 namespace vla::serve {
 
-/// The state that both threads and every observer may read.
+/// State that all threads may read.
 struct ServerState {
   std::atomic<bool> ready = false, stopping = false;
-  std::atomic<bool> draining = false;     // no act comes in line any more; it stops when the line is empty
-  std::atomic<bool> device_lost = false;  // acts that wait get the device's error
-  std::atomic<bool> ended = false;        // the I/O thread has
+  // draining: no act is queued any more, and the server stops when the queue is empty
+  std::atomic<bool> draining = false;
+  std::atomic<bool> device_lost = false;  // waiting acts are answered with the device's error
+  std::atomic<bool> ended = false;  // the I/O thread has stopped
   std::atomic<std::uint64_t> n_chunk = 0, n_error = 0;
   std::atomic<Clock::rep> ready_since = 0;
 
@@ -27,25 +28,25 @@ struct ServerState {
   Health health(const Exchange& exchange) const;
 };
 
-/// The I/O thread, on which the front ends receive requests, answer at once what needs no engine, and put acts in line;
-/// it sends what comes back. It never computes, so that no client waits for it while another one's act runs.
+/// The I/O thread. Front ends receive requests on it, answer at once what needs no engine, and queue acts; it sends the
+/// answers. It never computes, so no client waits for it while another one's act runs.
 class Io {
  public:
   using Fronts = std::vector<std::unique_ptr<Front>>;
-  /// Everything outlives the thread.
+  /// All arguments must outlive the thread.
   Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, Policies& policies, ServerState& state,
      std::span<Observer* const> observers);
 
-  /// Until the server is stopped, what is computed is answered, and what waits is refused.
+  /// Runs until the server is stopped. Computed acts are answered then, waiting ones refused.
   void run();
 
-  /// For the front ends. A request that came; then one of the next three, which answers it exactly once. The job is
-  /// lost where they throw for lack of memory.
+  /// For front ends: reports a received request. One of the next three must follow and answers it exactly once. If they
+  /// throw for lack of memory, the job is lost.
   void received(const Received& request);
-  /// Puts an act in line, whose `deadline_ms` is checked.
+  /// Queues an act and checks its `deadline_ms`.
   void submit(Job job);
   void answer(Job job, std::string response);
-  /// Makes the error only where the memory for it may be lacking.
+  /// Refuses a request; the error is created only if there may be memory for it.
   template <class MakeError>
   void refuse(Job job, MakeError error) noexcept {
     Answer answer;
@@ -59,10 +60,10 @@ class Io {
     send_answer(answer);
   }
   void dropped(const Dropped& connection);
-  void count_error() noexcept { ++state_.n_error; }  // of a request that was refused without a job
-  void stop() noexcept;                              // as Server::stop
+  void count_error() noexcept { ++state_.n_error; }  // for a request that was refused without a job
+  void stop() noexcept;  // see Server::stop
   Clock::time_point now() const { return loop_.now(); }
-  /// The description of a policy by its name, as Policies::find, with the names of all.
+  /// The description of a policy by name (Policies::find), with the names of all policies.
   Result<v1::Description> describe(const std::string& policy) const;
   Health health() const { return state_.health(exchange_); }
 

@@ -6,19 +6,18 @@
 
 namespace vla::serve {
 
-/// The keys that the clients of a published robot send, and what a policy for it calls them: the first of `features`
-/// that the bundle has. Colours are RGB, angles radians and grippers as the policy was trained on, unless a line says
-/// otherwise.
+/// The keys that clients of a published robot send, and the names that policies use for them: the first of `features`
+/// that the bundle has. Colours are RGB, angles radians and grippers as in training, unless a line says otherwise.
 struct Preset {
   struct Key {
     const char* key;
-    int width;             // of a state; 0: an image
-    bool required;         // else it may be missing in the bundle
+    int width;  // width of a state; 0: an image
+    bool required;  // else the bundle may lack it
     const char* features;  // last parts of names, separated by spaces
   };
   const char* name;
   std::span<const Key> keys;
-  const char* gripper;  // the convention of the data set, for people
+  const char* gripper;  // the data set's convention, for people
 };
 
 /// Source: openpi, src/openpi/policies/{libero,droid,aloha}_policy.py.

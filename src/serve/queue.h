@@ -38,11 +38,11 @@ class Queue {
 
   std::size_t size() const { return line_.size(); }
   bool empty() const { return line_.empty(); }
-  /// Whether more than `kCrowd` clients of the peer wait whose turn is next.
+  /// Whether more than `kCrowd` clients of the next peer wait.
   bool is_crowded() const { return !turns_.empty() && n_of(turns_.front().group) > kCrowd; }
 
-  /// Puts a job in line. Those that do not wait afterwards come back: `superseded` the older job of the same client,
-  /// `refused` the given one or the last ones of a peer that has more in line.
+  /// Queues a job. Jobs that do not wait afterwards are returned: `superseded` is the client's older job, `refused` the
+  /// given job or the last ones of a peer that has more in the queue.
   struct Pushed {
     std::optional<Job> superseded;
     std::vector<Job> refused;
@@ -61,7 +61,7 @@ class Queue {
         result.refused.push_back(std::move(job));
         return result;
       }
-      result.refused.reserve(result.refused.size() + 1);  // before it is taken out of the line
+      result.refused.reserve(result.refused.size() + 1);  // read before it leaves the queue
       result.refused.push_back(take(last));
     }
     if (older == line_.end()) {
@@ -73,13 +73,13 @@ class Queue {
     return result;
   }
 
-  /// Takes a job out whose deadline is not after `now`.
+  /// Removes a job whose deadline is at or before `now`.
   std::optional<Job> take_late(Clock::time_point now) {
     const auto late = find([&](const Job& job) { return job.deadline && *job.deadline <= now; });
     return late == line_.end() ? std::nullopt : std::optional<Job>(take(late));
   }
 
-  /// When `take_late` has something to take, if nothing changes before.
+  /// When `take_late` will have a job next.
   std::optional<Clock::time_point> first_deadline() const {
     std::optional<Clock::time_point> first;
     for (const Job& job : line_)
@@ -101,7 +101,7 @@ class Queue {
   using Place = typename std::list<Job>::iterator;
   struct Turn {
     std::string group;
-    Clock::time_point last = {};  // in a crowd: when the connection came that had its last turn
+    Clock::time_point last = {};  // in a crowd: arrival of the connection that had its last turn
   };
 
   template <class Wanted>
@@ -109,7 +109,7 @@ class Queue {
     return std::find_if(line_.begin(), line_.end(), wanted);
   }
 
-  /// Takes all memory before it changes anything: where there is none, the queue stays as it was.
+  /// Allocates before it changes anything, so the queue is unchanged if memory runs out.
   void wait(Job job) {
     std::list<Turn> turn;
     if (n_of(job.share.group) == 0) turn.push_back({job.share.group});
@@ -125,17 +125,17 @@ class Queue {
         std::count_if(line_.begin(), line_.end(), [&](const Job& job) { return job.share.group == group; }));
   }
 
-  /// The generations of the clients of the group that wait, and the given ones.
+  /// The generations of a group's waiting clients and the given ones.
   Generations generations_of(const std::string& group, std::vector<Clock::time_point> times = {}) const {
     for (const Job& job : line_)
       if (job.share.group == group) times.push_back(job.share.since);
     return Generations(std::move(times));
   }
 
-  /// The first job, in a crowd of the group, of the next older generation after the one that had the last turn;
-  /// after the oldest comes the newest. Those that come meanwhile are newer: they delay nobody.
+  /// In a crowd: the group's first job of the next older generation after the one that had the last turn; after the
+  /// oldest comes the newest. Later arrivals are newer and delay nobody.
   Place next_generation(Turn& turn) {
-    const Generations generations = generations_of(turn.group, {turn.last});  // it may have left the queue
+    const Generations generations = generations_of(turn.group, {turn.last});  // that connection may have left the queue
     const auto distance = [&](const Job& job) {
       const std::size_t n = generations.size();
       return job.share.group == turn.group ? (generations.of(turn.last) + n - generations.of(job.share.since) - 1) % n
@@ -147,8 +147,7 @@ class Queue {
     return next;
   }
 
-  /// The job that gives way to the given one, which adds an amount to what its peer has; none where that would be
-  /// unfair.
+  /// The job that must leave so that the given one fits, which adds `amount` to its peer; none if that would be unfair.
   template <class Amount>
   Place to_give_way(const Job& job, Amount amount, std::size_t added) {
     std::map<std::string, std::size_t> sums = {{job.share.group, added}};
@@ -158,8 +157,8 @@ class Queue {
     return last_of_largest_generation(job.share.group, amount, &job, added);
   }
 
-  /// The last of a group's jobs in the generation that amounts to most; of equal ones it is the newest. None where
-  /// a newcomer's own generation would have as much by what it adds.
+  /// The last job of the group's largest generation, the newest if several are equal. None if the newcomer's own
+  /// generation would be as large.
   template <class Amount>
   Place last_of_largest_generation(const std::string& group, Amount amount, const Job* newcomer = nullptr,
                                    std::size_t added = 0) {
@@ -187,8 +186,8 @@ class Queue {
   }
 
   Limits limits_;
-  std::list<Job> line_;    // of at most as many clients as fit: a search by name costs nothing beside one act
-  std::list<Turn> turns_;  // of the peers that have a job in line, the next one first
+  std::list<Job> line_;  // at most as many clients as fit: a linear search costs nothing beside an act
+  std::list<Turn> turns_;  // peers with a queued job, the next one first
   std::size_t bytes_ = 0;
 };
 

@@ -10,29 +10,29 @@
 
 namespace vla::serve::gr00t {
 
-/// How a client of one of the releases sends an act, and so how it reads the answer.
+/// Which release a client speaks, and thus how it reads the answer.
 struct Dialect {
   msgpack::Framing framing = msgpack::Framing::numpy;
-  bool is_n1_5 = false;     // `data` is the observation itself, and the answer a map without a batch's list
-  bool is_flat = false;     // keys are `video.camera` and so on, also those of the answer
-  bool is_batched = false;  // actions have a dimension of one for the batch
+  bool is_n1_5 = false;  // `data` is the observation, and the answer a map without a batch list
+  bool is_flat = false;  // keys such as `video.camera`, also in the answer
+  bool is_batched = false;  // actions have a batch dimension of one
 };
 
-/// The part of a request that is one observation, its maps flattened to keys such as `video.front`, and its text at
-/// `text`. Errors: bad_observation for what is no observation, for more than one, or for more than one time step.
+/// Extracts one observation from a request: maps flattened to keys such as `video.front`, and the text at `text`.
+/// Errors: bad_observation if it is not an observation, or has more than one observation or time step.
 struct Observed {
   Dialect dialect;
-  msgpack::Value flat;  // over the request's bytes and `keys`
+  msgpack::Value flat;  // points into the request's bytes and `keys`
   std::deque<std::string> keys;
   Extension extension;
 };
 Result<Observed> read_observation(const msgpack::Value* data);
 
-/// The answer to an act. Columns of actions with names such as `arm.0`, `arm.1` are one array, `arm`.
+/// Encodes the answer to an act. Action columns named `arm.0`, `arm.1`, ... become one array `arm`.
 std::string encode_reply(Reply reply, const Dialect& dialect, const Names& names, const v1::Description& description);
 
-/// The answer to get_modality_config. Clients ask before they have sent an array, so that N1.6 and N1.7, which know it
-/// by other marks, get both.
+/// Answers get_modality_config. Clients ask before they send an array, so the release is unknown, and the answer has
+/// the marks of both N1.6 and N1.7.
 std::string encode_modalities(const Dialect& dialect, const Names& names, const v1::Description& description);
 
 std::string encode_error(const Error& error);

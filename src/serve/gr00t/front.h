@@ -35,7 +35,7 @@ class Front final : public serve::Front, zmtp::Hub::Handler {
   std::string address_;
   v1::Description description_;
   Names names_;
-  Dialect last_;  // of the last act: requests without arrays do not tell theirs
+  Dialect last_;  // release of the last act, for requests without arrays
   Io* io_ = nullptr;
 };
 

@@ -20,7 +20,7 @@ Error not_a_message(std::string expected, std::string found) {
 
 bool is_key(const Value& value) { return value.type == Type::text || value.type == Type::bytes; }
 
-/// Builds the tree; each callback returns false where the message is refused.
+/// Builds the tree. A callback returns false to refuse the message.
 class Reader : public ::msgpack::null_visitor {
  public:
   Value root;
@@ -61,7 +61,7 @@ class Reader : public ::msgpack::null_visitor {
     }
     return true;
   }
-  /// The number of items comes from the message: memory is reserved for those that the bound allows.
+  /// The message states the number of items, so memory is reserved only up to the limit.
   bool open(Value value, std::uint64_t n_item) {
     if (open_.size() == kMaxDepth) return refuse("fewer levels", fmt::format("more than {}", kMaxDepth));
     if (n_item > kMaxValues - n_value_) return refuse("fewer values", fmt::format("more than {}", kMaxValues));
@@ -85,7 +85,7 @@ class Reader : public ::msgpack::null_visitor {
     return true;
   }
 
-  std::vector<Value*> open_;  // from the outermost list or map: each is the last item of the one before, and stays
+  std::vector<Value*> open_;  // open lists and maps, outermost first; each is the last item of the one before
   std::size_t n_value_ = 0;
 };
 

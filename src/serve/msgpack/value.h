@@ -11,7 +11,7 @@
 
 namespace vla::msgpack {
 
-/// A value of a message. Text and bytes stay in the message, which outlives the value.
+/// A value of a message. Text and bytes point into the message, which must outlive it.
 struct Value {
   enum class Type { nil, boolean, integer, real, text, bytes, list, map };
 
@@ -19,22 +19,22 @@ struct Value {
   bool boolean = false;
   std::int64_t integer = 0;
   double real = 0;
-  std::string_view data;     // of text and bytes
-  std::vector<Value> items;  // of a list; of a map its keys and values by turns, keys being text or bytes
+  std::string_view data;  // of text or bytes
+  std::vector<Value> items;  // items of a list; alternating keys and values of a map, whose keys are text or bytes
 
   bool is_text() const { return type == Type::text; }
   bool is_map() const { return type == Type::map; }
   bool is_list() const { return type == Type::list; }
   bool is_true() const { return type == Type::boolean && boolean; }
-  /// The value at a key, which may have come as text or as bytes; null where there is none or this is no map.
+  /// The value at a key, sent as text or as bytes; null if it is missing or this is not a map.
   const Value* find(std::string_view key) const;
 };
 
-constexpr std::size_t kMaxValues = 4096;  // of a message: those of arrays are bytes
+constexpr std::size_t kMaxValues = 4096;  // limits of a message; an array counts as bytes
 constexpr std::size_t kMaxDepth = 8;
 
-/// Reads one message whole. Errors: bad_request for what is cut off, has bytes left over, an extension type, a key that
-/// is neither text nor bytes or comes twice, text that is not UTF-8, or more values or levels than the bounds.
+/// Parses one whole message. Errors: bad_request if it is truncated, has bytes left over, an extension type, a key that
+/// is not text or bytes or occurs twice, text that is not UTF-8, or more values or levels than the limits.
 Result<Value> read(std::span<const std::byte> message);
 
 }  // namespace vla::msgpack

@@ -11,7 +11,7 @@
 
 namespace vla::msgpack {
 
-/// Writes one message, value after value. A map of n entries is followed by n keys and values by turns.
+/// Writes one message, value by value. After a map of n entries write n alternating keys and values.
 class Writer {
  public:
   Writer& map(std::size_t n);
@@ -26,7 +26,7 @@ class Writer {
   Writer& array(Framing framing, std::span<const std::size_t> shape, std::span<const float> values);
 
   std::string take() { return std::move(out_); }
-  void write(const char* data, std::size_t size) { out_.append(data, size); }  // for the library
+  void write(const char* data, std::size_t size) { out_.append(data, size); }  // interface that the library expects
 
  private:
   std::string out_;

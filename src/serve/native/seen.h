@@ -8,8 +8,8 @@
 
 namespace vla::serve {
 
-/// What the network of the robot that an act names gets of the act's view of this number (picture_of). It costs what an
-/// act of this view alone may cost. From any thread. Errors: bad_observation, too_large.
+/// The picture that the network gets of one view of an act (picture_of), for the robot that the act names. It costs at
+/// most what an act of this view may cost. Any thread may call it. Errors: bad_observation, too_large.
 Result<Frame> seen(const v1::Act& act, int view, const Engine& engine, std::int64_t max_pixels);
 
 }  // namespace vla::serve

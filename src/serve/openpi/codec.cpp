@@ -60,7 +60,7 @@ Result<ActRequest> decode_act(const msgpack::Value& message, const Names& names,
   VLA_TRY(request.observation, observe(message, names, limits));
   request.observation.embodiment = embodiment;
   VLA_TRY(const Extension extension, extension_of(message.find(kExtension), kExtension));
-  request.seed = extension.seed ? *extension.seed : fresh_seed() >> 1;  // integers of msgpack's clients have a sign
+  request.seed = extension.seed ? *extension.seed : fresh_seed() >> 1;  // msgpack clients expect signed integers
   request.noise = *request.seed;
   return request;
 }

@@ -17,41 +17,41 @@ namespace vla::serve::openpi {
 struct Peer {
   std::uint64_t connection = 0;
   std::string address;
-  Clock::time_point since = {};         // it is connected
-  std::uint64_t n_request = 0;          // that came so far
-  std::optional<double> total_ms = {};  // from the receipt of the last request to its answer's departure
+  Clock::time_point since = {};  // since it connected
+  std::uint64_t n_request = 0;  // received so far
+  std::optional<double> total_ms = {};  // from receiving the last request to sending its answer
 };
 
-/// WebSocket connections at one address, and HTTP's `/healthz`. All of it runs inside the loop's `wait`, and no peer is
-/// waited for. A connection has one request in work: what it sends meanwhile waits, one message of it in memory. Pings
-/// are answered at all times.
+/// WebSocket connections at one address, and HTTP's `/healthz`. Everything runs inside the loop's `wait`, which never
+/// blocks on a peer. A connection has one request in work; one later message waits in memory. Pings are always
+/// answered.
 class Sockets {
  public:
   using Limits = net::ConnectionLimits;
   class Handler {
    public:
     virtual ~Handler() = default;
-    /// The first message of a connection.
+    /// Returns the first message of a connection.
     virtual std::string greeting() const = 0;
-    /// A message, which `send` or `fail` answers, now or later.
+    /// Handles a message. `send` or `fail` answers it, now or later.
     virtual void received(Peer& peer, std::string message, bool is_text) = 0;
-    /// A connection that the server ended. `why` is one word, as Hub::Handler's.
+    /// Called when the server ended a connection. `why` is one word, as in Hub::Handler.
     virtual void dropped(const Peer& peer, const std::string& why, const std::string& detail) = 0;
   };
 
-  /// `api_key`: what clients have to send as `Authorization: Api-Key KEY`; empty: whatever they send.
+  /// `api_key`: clients must send `Authorization: Api-Key KEY`; empty: no check.
   Sockets(net::Loop& loop, const Limits& limits, std::string api_key);
   ~Sockets();
 
-  /// Binds an address as tcp_endpoint_of reads it. It with the port filled in. Errors: usage, io.
+  /// Binds an address (see tcp_endpoint_of). Returns it with its port. Errors: usage, io.
   Result<std::string> bind(const std::string& address, const char* option, bool insecure);
-  /// Takes connections from now on; to be called before every turn of the loop. The handler outlives it.
+  /// Accepts connections from now on; call it before every turn of the loop. The handler must outlive this.
   void begin(Handler& handler);
-  /// A binary message. A connection that has ended does not get it.
+  /// Sends a binary message, unless the connection has ended.
   void send(std::uint64_t connection, std::string message);
-  /// A text message, then the end with code 1011, as the reference tells of an error.
+  /// Sends a text message, then closes with code 1011, as the reference reports an error.
   void fail(std::uint64_t connection, std::string text);
-  /// Ends it without a word, where there is no memory for one.
+  /// Closes without a message, if there is no memory for one.
   void drop(std::uint64_t connection) noexcept;
   bool has_answers() const;
 
