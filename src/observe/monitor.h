@@ -11,7 +11,7 @@ namespace vla::serve {
 class Monitor {
  public:
   struct Sources {
-    std::function<std::string()> metrics;  // text in exposition format
+    std::function<std::string()> metrics;           // text in exposition format
     std::function<std::string()> not_ready_reason;  // why no acts are taken; empty if they are
   };
   /// As Http::open. The functions are called on Http's thread.

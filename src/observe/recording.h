@@ -66,7 +66,7 @@ class Recording {
     std::size_t index = 0;  // from 1
     std::string request, response;
     std::uint64_t client = 0;  // identifies the connection
-    std::uint64_t at_ns = 0;  // arrival of the request, since 1970
+    std::uint64_t at_ns = 0;   // arrival of the request, since 1970
   };
   /// Errors: io, bad_request (not a recording, damaged, truncated).
   static Result<Recording> open(const std::string& folder);

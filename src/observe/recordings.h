@@ -19,10 +19,10 @@ class Recordings final : public Observer {
   /// State of the current recording, or of the last one.
   struct Standing {
     bool on = false;
-    std::string folder;  // empty before the first one
+    std::string folder;           // empty before the first one
     std::uint64_t n_request = 0;  // in it
-    std::uint64_t bytes = 0;  // bytes of all recordings
-    std::string why;  // why it ended by itself; else empty
+    std::uint64_t bytes = 0;      // bytes of all recordings
+    std::string why;              // why it ended by itself; else empty
   };
 
   /// `max_bytes`: limit of all recordings together.
@@ -53,11 +53,11 @@ class Recordings final : public Observer {
   const std::string folder_;
   const std::uint64_t max_bytes_;
   std::function<void(const Standing&)> tell_;
-  std::mutex changing_;  // held while a recording starts or ends, which may wait for a disk
+  std::mutex changing_;       // held while a recording starts or ends, which may wait for a disk
   mutable std::mutex mutex_;  // guards the rest, held briefly
   std::optional<v1::Description> description_;
   std::unique_ptr<Recorder> recorder_;  // kept after it ended by itself, until a person ends it or starts another
-  Standing last_;  // bytes of closed recordings
+  Standing last_;                       // bytes of closed recordings
 };
 
 }  // namespace vla::serve

@@ -8,13 +8,13 @@ namespace vla::serve {
 
 struct ReplayOptions {
   std::string address = "tcp://127.0.0.1:5555";
-  std::size_t first = 0;  // most requests to send; 0: all
+  std::size_t first = 0;    // most requests to send; 0: all
   int timeout_ms = 60'000;  // timeout per answer
 };
 
 /// A field that differs between the recorded answer and the new one.
 struct Difference {
-  std::size_t index = 0;  // index of the request in the recording, from 1
+  std::size_t index = 0;         // index of the request in the recording, from 1
   std::uint64_t request_id = 0;  // value in the recorded answer
   std::string field, recorded, replayed;
 };

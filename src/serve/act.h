@@ -18,7 +18,7 @@ struct ActLimits {
   std::size_t max_views = 0;
   int horizon = 0, d_noise = 0;  // size of the policy's noise
   int d_action = 0;              // of a chunk
-  const Fit* fit = nullptr;  // the recipe's image ops
+  const Fit* fit = nullptr;      // the recipe's image ops
 };
 
 /// An act, decoded for the engine.

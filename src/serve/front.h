@@ -22,7 +22,7 @@ class Io;
 struct Reply {
   const ActRequest& request;
   ActionChunk chunk;  // `timing` includes the server's stages
-  double queue_ms;  // time that the act waited
+  double queue_ms;    // time that the act waited
 };
 
 /// An act and its answer as serialized v1::Request and v1::Response.
@@ -51,9 +51,9 @@ class Call {
 /// A request on its way through the server.
 struct Job : Received {
   std::unique_ptr<Call> call;
-  std::string policy_name;  // name that the client gave; empty for the only policy or the default
-  std::shared_ptr<ServedPolicy> policy;  // the policy that answers, once it is queued
-  net::Share share;  // for fairness between peers
+  std::string policy_name;                   // name that the client gave; empty for the only policy or the default
+  std::shared_ptr<ServedPolicy> policy;      // the policy that answers, once it is queued
+  net::Share share;                          // for fairness between peers
   std::optional<std::uint64_t> deadline_ms;  // from receipt until it must be started
   std::optional<Clock::time_point> deadline;
 };

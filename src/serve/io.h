@@ -20,7 +20,7 @@ struct ServerState {
   // draining: no act is queued any more, and the server stops when the queue is empty
   std::atomic<bool> draining = false;
   std::atomic<bool> device_lost = false;  // waiting acts are answered with the device's error
-  std::atomic<bool> ended = false;  // the I/O thread has stopped
+  std::atomic<bool> ended = false;        // the I/O thread has stopped
   std::atomic<std::uint64_t> n_chunk = 0, n_error = 0;
   std::atomic<Clock::rep> ready_since = 0;
 
@@ -61,7 +61,7 @@ class Io {
   }
   void dropped(const Dropped& connection);
   void count_error() noexcept { ++state_.n_error; }  // for a request that was refused without a job
-  void stop() noexcept;  // see Server::stop
+  void stop() noexcept;                              // see Server::stop
   Clock::time_point now() const { return loop_.now(); }
   /// The description of a policy by name (Policies::find), with the names of all policies.
   Result<v1::Description> describe(const std::string& policy) const;

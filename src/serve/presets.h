@@ -11,8 +11,8 @@ namespace vla::serve {
 struct Preset {
   struct Key {
     const char* key;
-    int width;  // width of a state; 0: an image
-    bool required;  // else the bundle may lack it
+    int width;             // width of a state; 0: an image
+    bool required;         // else the bundle may lack it
     const char* features;  // last parts of names, separated by spaces
   };
   const char* name;

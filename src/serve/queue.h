@@ -186,7 +186,7 @@ class Queue {
   }
 
   Limits limits_;
-  std::list<Job> line_;  // at most as many clients as fit: a linear search costs nothing beside an act
+  std::list<Job> line_;    // at most as many clients as fit: a linear search costs nothing beside an act
   std::list<Turn> turns_;  // peers with a queued job, the next one first
   std::size_t bytes_ = 0;
 };

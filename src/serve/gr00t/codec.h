@@ -13,8 +13,8 @@ namespace vla::serve::gr00t {
 /// Which release a client speaks, and thus how it reads the answer.
 struct Dialect {
   msgpack::Framing framing = msgpack::Framing::numpy;
-  bool is_n1_5 = false;  // `data` is the observation, and the answer a map without a batch list
-  bool is_flat = false;  // keys such as `video.camera`, also in the answer
+  bool is_n1_5 = false;     // `data` is the observation, and the answer a map without a batch list
+  bool is_flat = false;     // keys such as `video.camera`, also in the answer
   bool is_batched = false;  // actions have a batch dimension of one
 };
 

@@ -19,7 +19,7 @@ struct Value {
   bool boolean = false;
   std::int64_t integer = 0;
   double real = 0;
-  std::string_view data;  // of text or bytes
+  std::string_view data;     // of text or bytes
   std::vector<Value> items;  // items of a list; alternating keys and values of a map, whose keys are text or bytes
 
   bool is_text() const { return type == Type::text; }

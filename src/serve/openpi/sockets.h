@@ -17,8 +17,8 @@ namespace vla::serve::openpi {
 struct Peer {
   std::uint64_t connection = 0;
   std::string address;
-  Clock::time_point since = {};  // since it connected
-  std::uint64_t n_request = 0;  // received so far
+  Clock::time_point since = {};         // since it connected
+  std::uint64_t n_request = 0;          // received so far
   std::optional<double> total_ms = {};  // from receiving the last request to sending its answer
 };
 
