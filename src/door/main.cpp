@@ -48,6 +48,7 @@ class Door final : Link::Handler, Robots::Server {
         robots_([] { return Clock::now(); },
                 {kReceiptMessages * given.max_message, given.max_message, given.max_connections}, rpcs_, *this),
         most_queued_(kReceiptMessages * given.max_message) {}
+  ~Door() override { rpcs_.end(); }
 
   void start() {
     link_.start(*this);

@@ -260,9 +260,9 @@ class Connection : public std::enable_shared_from_this<Connection> {
     const std::span<const std::uint8_t> bytes(shared_.in.data(), n);
     if (const char* too_much = floods_.count(std::as_bytes(bytes), shared_.loop.now()))
       return drop("flood", fmt::format("too many {}", too_much));
-    is_receiving_ = true;
+    is_in_library_ = true;
     const auto used = nghttp2_session_mem_recv(session_, bytes.data(), bytes.size());
-    is_receiving_ = false;
+    is_in_library_ = false;
     if (is_closed_) return;
     if (used < 0) return drop("protocol", nghttp2_strerror(static_cast<int>(used)));
     if (nghttp2_session_get_outbound_queue_size(session_) > kMaxOutbound) return drop("stalled", "it does not read");
@@ -272,11 +272,14 @@ class Connection : public std::enable_shared_from_this<Connection> {
     if (!is_closed_) read();
   }
   void flush() {
-    if (is_writing_ || is_closed_ || is_receiving_) return;
+    if (is_writing_ || is_closed_ || is_in_library_) return;
     out_.clear();
     while (out_.size() < kWriteAtOnce) {
       const std::uint8_t* bytes = nullptr;
+      is_in_library_ = true;
       const auto n = nghttp2_session_mem_send(session_, &bytes);
+      is_in_library_ = false;
+      if (is_closed_) return;
       if (n < 0) return drop("protocol", nghttp2_strerror(static_cast<int>(n)));
       if (n == 0) break;
       out_.append(reinterpret_cast<const char*>(bytes), static_cast<std::size_t>(n));
@@ -333,11 +336,13 @@ class Connection : public std::enable_shared_from_this<Connection> {
     shared_.n_held += static_cast<std::size_t>(n);
   }
   void refuse_late() {
-    std::vector<Call*> late;
+    std::vector<std::int32_t> late;
     for (const auto& [stream, call] : calls_)
       if (!call->is_whole && !call->is_answered && shared_.loop.now() - call->began > kReceiptPatience)
-        late.push_back(call.get());
-    for (Call* call : late) refuse(*call, {Code::late, "call", "a whole message within 60 s", "a part"});
+        late.push_back(stream);
+    for (const std::int32_t stream : late)  // a refusal that is sent may end other calls
+      if (Call* const call = find(stream))
+        refuse(*call, {Code::late, "call", "a whole message within 60 s", "a part"});
   }
   void take_frames(Call& call);
   Status take_message(Call& call, std::string_view message);
@@ -354,7 +359,9 @@ class Connection : public std::enable_shared_from_this<Connection> {
   std::size_t n_held_ = 0;
   Clock::time_point served_ = {}, began_ = {};
   int age_ = 0, silent_ = 0, stalled_ = 0;  // sweeps: since it came, since a sign of life, since it took our bytes
-  bool is_open_ = false, is_closed_ = false, is_writing_ = false, is_receiving_ = false;
+  bool is_open_ = false, is_closed_ = false, is_writing_ = false;
+  // The library calls us, and may not be called to send meanwhile: the end of one call can answer another one.
+  bool is_in_library_ = false;
 };
 
 void Connection::begin_call(std::int32_t stream) {
@@ -550,7 +557,6 @@ class Rpcs::All : public Shared {
     nghttp2_option_set_no_closed_streams(option_, 1);  // it would remember some for priorities
   }
   ~All() {
-    close_all();
     nghttp2_option_del(option_);
     nghttp2_session_callbacks_del(callbacks_);
   }
@@ -615,6 +621,7 @@ void Rpcs::refuse(std::uint64_t id, const Error& error) noexcept {
     call->second->connection.refuse(*call->second, error);
 }
 void Rpcs::stop() { all_->stop(); }
+void Rpcs::end() { all_->close_all(); }
 bool Rpcs::has_answers() const { return all_->has_answers(); }
 
 }  // namespace vla::door

@@ -28,6 +28,8 @@ class Rpcs final : public serve::lerobot::Calls {
   /// Takes no connection and no call any more.
   void stop();
   bool has_answers() const;
+  /// Closes every connection. Call it while the handler lives: it is told of each.
+  void end();
 
  private:
   class All;
