@@ -4,8 +4,6 @@
 
 #include <fmt/format.h>
 
-#include <optional>
-
 #include "base/clock.h"
 #include "processor/ops/op.h"
 
@@ -86,17 +84,18 @@ Error not_finite(Engine& engine, const Observation& observation, std::uint64_t s
 
 Status warm_up(Engine& engine, const Robot& robot) {
   Error refused;
-  std::optional<std::uint64_t> not_finite_at;
+  bool is_finite = true;
+  std::uint64_t last = 0;
   for (std::uint64_t number = 0; number < kTries; ++number) {
     const Status answered = act(engine, largest_observation(robot, number), number);
     if (answered) return {};
     refused = answered.error();
-    if (refused.code == Code::bad_action) not_finite_at = number;
+    if (refused.code == Code::bad_action) is_finite = false, last = number;
     if (refused.code == Code::bad_action || refused.code == Code::bad_observation) continue;
-    not_finite_at.reset();
+    is_finite = true;
     break;
   }
-  if (not_finite_at) refused = not_finite(engine, largest_observation(robot, *not_finite_at), *not_finite_at);
+  if (!is_finite) refused = not_finite(engine, largest_observation(robot, last), last);
   const std::string& tag = robot.bundle().embodiment();
   refused.where = fmt::format("{}{}: {}", robot.bundle().path(), tag.empty() ? "" : " of " + tag, refused.where);
   return refused;

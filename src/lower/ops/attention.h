@@ -36,8 +36,9 @@ struct AttentionOp {
   HeadRows q;
   bool rounds;  // to what the device rounds products to; else it is float32
   ValueId mask = kNone;
-  std::vector<ValueId> packed;  // of each segment what PackOp makes, or its keys and values where a target packs none
-  std::vector<std::int64_t> n_key;
+  // Of each segment what PackOp makes, or its keys and values where a target packs none.
+  std::vector<ValueId> packed = {};
+  std::vector<std::int64_t> n_key = {};
 
   Operands operands() {
     Operands all = q.operands();
