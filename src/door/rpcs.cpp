@@ -341,8 +341,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
       if (!call->is_whole && !call->is_answered && shared_.loop.now() - call->began > kReceiptPatience)
         late.push_back(stream);
     for (const std::int32_t stream : late)  // a refusal that is sent may end other calls
-      if (Call* const call = find(stream))
-        refuse(*call, {Code::late, "call", "a whole message within 60 s", "a part"});
+      if (Call* const call = find(stream)) refuse(*call, {Code::late, "call", "a whole message within 60 s", "a part"});
   }
   void take_frames(Call& call);
   Status take_message(Call& call, std::string_view message);

@@ -52,7 +52,7 @@ EXTERNAL = [
     (re.compile(r"jpeglib\.h"), {"processor"}),
     (re.compile(r"utf8proc\.h"), {"processor"}),
     (re.compile(r"png\.h"), {"processor", "bench"}),
-    (re.compile(r"google/protobuf/.*"), {"wire", "serve"}),
+    (re.compile(r"google/protobuf/.*"), {"wire", "observe", "serve"}),
     (re.compile(r"nghttp2/.*"), {"door"}),
     (re.compile(r"prometheus/.*"), {"observe", "cli"}),  # cli keeps the metrics
     (re.compile(r"zmq\.h(pp)?"), {"observe", "zmtp"}),  # of a client; keys in Z85
