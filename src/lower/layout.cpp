@@ -35,7 +35,7 @@ ValueId Layouts::copied(ValueId id, int order) {
   return copy;
 }
 
-ValueId Layouts::add_value(const Shape& shape, DType type, std::int64_t row) {
+ValueId Layouts::add_value(Shape shape, DType type, std::int64_t row) {
   const auto id = static_cast<ValueId>(lowering_.values.size());
   const Shape padded = {row, shape[1], shape[2], shape[3]};
   Value& value = lowering_.values.emplace_back();

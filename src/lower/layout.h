@@ -21,7 +21,7 @@ class Layouts {
   /// Copies the operands that do not lie as the step needs them, and notes them all as what it reads.
   void meet(Step& step, const Operands& operands);
   /// A value that the target makes on the way; `row`: elements from one row to the next.
-  ValueId add_value(const Shape& shape, DType type, std::int64_t row);
+  ValueId add_value(Shape shape, DType type, std::int64_t row);
   /// Has a product read x, or its norm, in another type, made just before the first that does.
   void round(const Step& step, LinearOp& op, DType type, std::int64_t row, const char* verb);
 

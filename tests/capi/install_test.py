@@ -41,7 +41,7 @@ def test_ggml_and_our_own_rooms_are_inside_the_library_and_its_name_has_the_vers
 def test_an_installation_has_these_files_and_no_others(prefix, build):
     files = {path.relative_to(prefix).as_posix() for path in prefix.rglob("*") if not path.is_dir()}
     assert files == {
-        "bin/vla", "include/vla/vla.h", "lib/libvla.so", "lib/libvla.so.1", "lib/pkgconfig/vla.pc",
+        "bin/vla", "libexec/vla/vla-door-lerobot", "include/vla/vla.h", "lib/libvla.so", "lib/libvla.so.1", "lib/pkgconfig/vla.pc",
         *(f"lib/cmake/vla/{f}.cmake" for f in ("vlaConfig", "vlaConfigVersion", "vlaTargets", "vlaTargets-release")),
         "share/doc/vla/LICENSE", "share/doc/vla/LICENSES-third-party.md", "share/vla/vla.proto",
         "share/man/man1/vla.1", "share/bash-completion/completions/vla",

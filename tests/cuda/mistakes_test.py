@@ -16,8 +16,8 @@ MISTAKES = {
     "no barrier before a stage is read": (
         "linear_int8.cu",
         "linear_int8",
-        "    __syncthreads();  // the stage has",
-        "    // the stage has",
+        "    __syncthreads();  // the stage is",
+        "    // the stage is",
     ),
     "barrier before the wait": (
         "linear_int8.cu",
@@ -107,8 +107,8 @@ MISTAKES = {
     "no barrier before stages become room": (
         "linear_int8.cu",
         "linear_int8",
-        "  __syncthreads();  // the stages become",
-        "  // the stages become",
+        "  __syncthreads();  // the stages' memory",
+        "  // the stages' memory",
     ),
     "sums pass without waiting for lanes": (
         "store_sums.h",
@@ -184,8 +184,8 @@ MISTAKES = {
     "no barrier before x is written again": (
         "linear_f32.cu",
         "linear_f32",
-        "    __syncthreads();  // all have read",
-        "    // all have read",
+        "    __syncthreads();  // all threads have read",
+        "    // all threads have read",
     ),
     "a row of float32 too far": (
         "linear_f32.cu",
@@ -198,8 +198,8 @@ MISTAKES = {
     "no barrier before keys are fetched again": (
         "attention.cu",
         "attention",
-        "    __syncthreads();  // all have read the stage",
-        "    // all have read the stage",
+        "    __syncthreads();  // all threads have read the stage",
+        "    // all threads have read the stage",
     ),
     "what was summed does not shrink": (
         "attention.cu",
@@ -243,8 +243,8 @@ MISTAKES = {
     "no barrier before partial sums are written again": (
         "rows.cu",
         "rows",
-        "  __syncthreads();  // the room may",
-        "  // the room may",
+        "  __syncthreads();  // earlier values may",
+        "  // earlier values may",
     ),
     "codes rounded half away from zero": (
         "rows.cu",
