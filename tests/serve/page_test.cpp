@@ -100,7 +100,7 @@ constexpr int kViews = 1, kStates = 2, kText = 3;
 
 TEST_CASE("small acts count with all that they take, so that any number of them stays within the page's memory") {
   const Watched watched;
-  const std::size_t before = resident_size();
+  [[maybe_unused]] const std::size_t before = resident_size();
   const std::string act = request_with("");
   for (int i = 0; i < 700'000; ++i) watched.refused(act);
   const json told = watched.acts();
