@@ -22,6 +22,7 @@
 #include "observe/trace.h"
 #include "serve/native/codec.h"
 #include "serve/support.h"
+#include "support/connect_http.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -93,19 +94,9 @@ struct Sample {
   }
 };
 
-int connect_http(const std::string& address) {
-  sockaddr_in at = {};
-  at.sin_family = AF_INET;
-  at.sin_port = htons(static_cast<std::uint16_t>(std::stoi(address.substr(address.rfind(':') + 1))));
-  at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
-  const int fd = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
-  REQUIRE(::connect(fd, reinterpret_cast<const sockaddr*>(&at), sizeof(at)) == 0);
-  return fd;
-}
-
 /// One request to a monitor of this machine; what comes back until the connection is closed.
 std::string ask_http(const std::string& address, const std::string& request) {
-  const int fd = connect_http(address);
+  const int fd = test::connect_http(address);
   CHECK(::send(fd, request.data(), request.size(), MSG_NOSIGNAL) == static_cast<ssize_t>(request.size()));
   std::string answer;
   std::array<char, 4096> part;
@@ -263,7 +254,7 @@ TEST_CASE("two hundred clients that drip their request keep no probe waiting") {
   std::vector<int> dripping;
   const auto start = Clock::now();
   for (int i = 0; i < 200; ++i) {
-    dripping.push_back(connect_http((*monitor)->address()));
+    dripping.push_back(test::connect_http((*monitor)->address()));
     for (const int fd : dripping) ::send(fd, "G", 1, MSG_NOSIGNAL);
   }
   CHECK(ask_http((*monitor)->address(), "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n").starts_with("HTTP/1.1 200"));

@@ -13,6 +13,7 @@
 
 #include "base/process.h"
 #include "serve/support.h"
+#include "support/connect_http.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -50,13 +51,7 @@ struct Watched {
   /// The body of an answer; how long it took, in seconds.
   std::string get(const std::string& path, double& seconds) const {
     const auto begun = Clock::now();
-    const std::string& address = page->address();
-    sockaddr_in at = {};
-    at.sin_family = AF_INET;
-    at.sin_port = htons(static_cast<std::uint16_t>(std::stoi(address.substr(address.rfind(':') + 1))));
-    at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
-    const int fd = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
-    REQUIRE(::connect(fd, reinterpret_cast<const sockaddr*>(&at), sizeof(at)) == 0);
+    const int fd = test::connect_http(page->address());
     const std::string asked = "GET " + path + "&token=t HTTP/1.1\r\nHost: x\r\n\r\n";
     REQUIRE(::send(fd, asked.data(), asked.size(), MSG_NOSIGNAL) == static_cast<ssize_t>(asked.size()));
     std::string answer;
