@@ -4,6 +4,7 @@
 
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <numeric>
 
 #include "cuda/machine.h"
@@ -21,13 +22,17 @@ struct Case {
   bool has_mask = false;
 };
 // Towers (72 and 80 wide, a batch of views), grouped heads, a prefix of keys before the step's own, few queries with
-// keys split, the widest head, and heads that no tile divides.
+// keys split, the widest head, heads that no tile divides, and keys of several tiles in segments that end within them.
 const Case kCases[] = {{70, 2, 2, 2, 72, 1, {70}},
                        {65, 4, 2, 1, 80, 1, {65}},
                        {16, 8, 2, 1, 64, 1, {41, 16}, true},
                        {50, 2, 1, 1, 128, 1, {130}},
                        {5, 8, 1, 1, 256, 3, {100, 0, 5}, true},
-                       {1, 2, 2, 1, 24, 4, {33, 1}}};
+                       {1, 2, 2, 1, 24, 4, {33, 1}},
+                       {7, 6, 2, 2, 64, 1, {200, 0, 60, 70}, true},
+                       {11, 6, 2, 1, 40, 2, {90, 41}},
+                       {9, 4, 1, 2, 128, 2, {70, 210}, true},
+                       {4, 10, 1, 1, 256, 1, {70, 63}, true}};
 
 /// q, k and v as one projection leaves them: rows of all heads side by side, one token after the other.
 class Trial {
@@ -70,8 +75,8 @@ class Trial {
   }
 
   /// y by the kernel that `how` launches, of elements that `convert` makes.
-  template <class T, class Convert>
-  std::vector<float> run(Launch (*how)(const AttentionJob&), bool y_is_bf16, Convert convert) const {
+  template <class T, class How, class Convert>
+  std::vector<float> run(How how, bool y_is_bf16, Convert convert) const {
     const Device<T> gq(convert(q)), gk(convert(k)), gv(convert(v));
     const Device<float> gmask(mask), y(q.size());
     const Device<std::uint16_t> half(q.size());
@@ -115,21 +120,40 @@ class Trial {
   std::vector<float> q, k, v, mask;
 };
 
+/// The least depth of a shape that heads fit.
+int depth_of(int d_head) {
+  int least = 256;
+  for (const AttentionShape& shape : kAttentionShapes)
+    if (shape.depth >= d_head) least = std::min(least, shape.depth);
+  return least;
+}
+
 }  // namespace
 
-TEST_CASE("attention on bf16 is within a rounding of its weights of doubles") {
+TEST_CASE("attention on bf16 is within a rounding of its weights of doubles in every shape of blocks") {
   counts = {};
-  for (const Case& c : kCases) {
-    const Trial trial(c);
-    const std::vector<double> expected = trial.expected();
-    INFO(c.n_query, " queries, heads of ", c.d_head);
-    in_every_schedule([&] {
-      const auto halves = [](const std::vector<float>& of) { return bf16_rows(of, 1, 1); };
-      CHECK(error(trial.run<std::uint16_t>(attention_bf16, false, halves), expected) < 4e-3);
-      if (schedule.seed == 0) CHECK(error(trial.run<std::uint16_t>(attention_bf16, true, halves), expected) < 8e-3);
-    });
+  for (const AttentionShape& shape : kAttentionShapes) {
+    int n_run = 0;
+    for (const Case& c : kCases) {
+      if (depth_of(c.d_head) != shape.depth) continue;
+      const Trial trial(c);
+      const std::vector<double> expected = trial.expected();
+      INFO(shape.kernel, ": ", c.n_query, " queries, heads of ", c.d_head);
+      const auto how = [&](const AttentionJob& job) { return attention_bf16(shape, job); };
+      in_every_schedule([&] {
+        const auto halves = [](const std::vector<float>& of) { return bf16_rows(of, 1, 1); };
+        CHECK(error(trial.run<std::uint16_t>(how, false, halves), expected) < 4e-3);
+        if (schedule.seed == 0) CHECK(error(trial.run<std::uint16_t>(how, true, halves), expected) < 8e-3);
+      });
+      ++n_run;
+    }
+    CHECK(n_run > 0);
   }
   CHECK(counts.bank_conflicts == 0);
+}
+
+TEST_CASE("blocks of attention fit the shared memory of every device") {
+  for (const AttentionShape& shape : kAttentionShapes) CHECK(shape.shared() <= static_cast<int>(kMaxShared));
 }
 
 TEST_CASE("attention in float32 is within 2e-6 of doubles") {

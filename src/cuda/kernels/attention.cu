@@ -60,6 +60,16 @@ VLA_DEVICE int count_keys(const AttentionJob& job) {
   return n;
 }
 
+/// The block's share of the keys of all segments, in whole sixteens: `first` to last - 1.
+struct Share {
+  int n_key, first, last;
+  VLA_DEVICE explicit Share(const AttentionJob& job) : n_key(count_keys(job)) {
+    const int each = (n_key + job.n_split * 16 - 1) / (job.n_split * 16) * 16, z = static_cast<int>(blockIdx.z);
+    first = z * each < n_key ? z * each : n_key;
+    last = first + each < n_key ? first + each : n_key;
+  }
+};
+
 /// The base that is subtracted from scores: the largest score, or any finite value for a row without keys, so that its
 /// weights are zero.
 VLA_DEVICE float finite(float most) { return most == kMinusInfinity ? 0 : most; }
@@ -71,184 +81,426 @@ VLA_DEVICE float* partial_row(const AttentionJob& job, int row, int split) {
   const std::int64_t unit = static_cast<std::int64_t>(split) * job.n_head_kv * job.n_batch + blockIdx.y;
   return job.partial + (unit * job.n_row() + row) * (job.d_head + 2);
 }
+/// Where a row of y begins.
+VLA_DEVICE std::int64_t y_row(const AttentionJob& job, const Unit& unit, int row) {
+  const std::int64_t token = static_cast<std::int64_t>(unit.batch) * job.n_query + query_of(job, row);
+  return (token * job.n_head + head_of(job, unit, row)) * job.d_head;
+}
 VLA_DEVICE void store_y(const AttentionJob& job, const Unit& unit, int row, int i, float value) {
-  const std::int64_t at = ((static_cast<std::int64_t>(unit.batch) * job.n_query + query_of(job, row)) * job.n_head +
-                           head_of(job, unit, row)) *
-                              job.d_head +
-                          i;
-  store(job.y, job.is_bf16, at, value);
+  store(job.y, job.is_bf16, y_row(job, unit, row) + i, value);
 }
 
-// Tensor cores: a warp has 16 rows, a block 64
+// Tensor cores
 
-constexpr int kRows = 64, kThreads = 128;
-
-template <int kDepth_>
+template <int kIndex>
 struct Shape {
-  static constexpr int kDepth = kDepth_, kKeys = kDepth == 256 ? 32 : 64;
-  static constexpr int kSteps = kDepth / 16, kTiles = kDepth / 8;
-  /// Rows are padded by 16 bytes, so that the eight rows of a matrix load are in different banks.
-  static constexpr int kRow = kDepth * 2 + 16, kTile = kKeys * kRow;
+  static constexpr AttentionShape kOf = kAttentionShapes[kIndex];
+  static constexpr int kDepth = kOf.depth, kRows = kOf.rows, kGroups = kOf.key_groups, kKeys = kOf.keys;
+  static constexpr int kThreads = kOf.n_thread(), kRowGroups = kRows / 16;
+  static constexpr bool kShares = kGroups > 1;  // whether warps share the keys of a tile
+  static constexpr int kRow = kOf.row(), kTile = kKeys * kRow;
+  VLA_DEVICE static constexpr int weight_row() { return kKeys * 2 + 16; }
   static constexpr bool kKeepsQ = kDepth <= 128;  // queries in registers
+  // Of a warp: keys in a tile, products of 16 x 8 x 16 in a row of scores and in the result, sums side by side for
+  // each.
+  static constexpr int kOwnKeys = kKeys / kGroups, kSteps = kDepth / 16, kTiles = kDepth / 8 / kGroups;
+  static constexpr int kScoreSums = kOwnKeys >= 32 ? 1 : 2, kSums = kTiles == 1 ? 2 : 1;
+
+  // Threads that copy a row, 16 bytes each: a power of two, so that each keeps its column.
+  static constexpr int kPerRow = kDepth == 80 ? 16 : kDepth / 8, kRowStep = kThreads / kPerRow;
+};
+template <class S>
+VLA_DEVICE int copied_column() {
+  return thread_index() % S::kPerRow * 8;
+}
+
+/// Copies a tile's keys or values to shared memory, which lie in one segment after the other.
+template <class S, HeadRows AttentionJob::Segment::*kWhich>
+class Reader {
+ public:
+  VLA_DEVICE Reader(const AttentionJob& job, const Unit& unit) : job_(job), unit_(unit) { enter(0); }
+
+  /// Rows of keys `first` to last - 1, as many as a tile has, and zeros behind them.
+  VLA_DEVICE void fetch(int first, int last, std::byte* to) {
+    const int n = last - first < S::kKeys ? last - first : S::kKeys;
+    for (int end = 0; end < S::kKeys;) {
+      const bool has_keys = end < n;
+      if (has_keys && end_ <= first + end) {
+        enter(segment_ + 1);
+        continue;
+      }
+      const int begin = end;
+      end = !has_keys ? S::kKeys : end_ - first < n ? end_ - first : n;
+      copy(begin, end, from_ + (has_keys ? (first - begin_) * token_ : 0), has_keys ? token_ : 0, has_keys ? size_ : 0,
+           to);
+    }
+  }
+
+ private:
+  VLA_DEVICE void enter(int segment) {
+    const HeadRows& rows = job_.segment[segment].*kWhich;
+    const int column = copied_column<S>();
+    segment_ = segment, begin_ = end_, end_ += job_.segment[segment].n_key, token_ = rows.token;
+    size_ = column < job_.d_head ? 16 : 0;
+    from_ = row_of<std::uint16_t>(rows, unit_.head_kv, 0, unit_.batch) + (size_ ? column : 0);
+  }
+  /// Rows `begin` to end - 1 of a tile. `from` is where its first row would be.
+  VLA_DEVICE static void copy(int begin, int end, const std::uint16_t* from, std::int64_t token, int size,
+                              std::byte* to) {
+    const int row = thread_index() / S::kPerRow, column = copied_column<S>();
+    if (S::kPerRow * 8 > S::kDepth && column >= S::kDepth) return;
+    from += row * token, to += row * S::kRow + column * 2;
+#pragma unroll
+    for (int i = 0; i < S::kKeys; i += S::kRowStep, from += S::kRowStep * token)
+      if (row + i >= begin && row + i < end) dev::copy_async(to + i * S::kRow, from, size);
+  }
+
+  const AttentionJob& job_;
+  const Unit& unit_;
+  const std::uint16_t* from_ = nullptr;  // this thread's column of the segment's first row
+  std::int64_t token_ = 0;
+  int segment_ = 0, begin_ = 0, end_ = 0, size_ = 0;
 };
 
-/// Copies rows to shared memory, padded with zeros after the last row and after d_head.
-template <class S, class RowOf>
-VLA_DEVICE void fetch_rows(std::byte* to, int n, int n_valid, int d_head, const void* somewhere, RowOf row_at) {
-  constexpr int kChunks = S::kDepth / 8;
-  for (int chunk = thread_index(); chunk < n * kChunks; chunk += kThreads) {
-    const int row = chunk / kChunks, i = chunk % kChunks * 8;
-    const bool valid = row < n_valid && i < d_head;
-    dev::copy_async(to + row * S::kRow + i * 2, valid ? row_at(row) + i : somewhere, valid ? 16 : 0);
-  }
-}
+/// Copies a block's rows of queries, and zeros behind the last.
 template <class S>
-VLA_DEVICE void fetch_keys(const AttentionJob& job, const Unit& unit, const Tiles<S::kKeys>& tile, std::byte* to) {
-  const AttentionJob::Segment& segment = job.segment[tile.segment];
-  const auto rows = [&](const HeadRows& of) {
-    return [&](int row) { return row_of<std::uint16_t>(of, unit.head_kv, tile.first + row, unit.batch); };
-  };
-  fetch_rows<S>(to, S::kKeys, tile.n_key(), job.d_head, segment.k.data, rows(segment.k));
-  fetch_rows<S>(to + S::kTile, S::kKeys, tile.n_key(), job.d_head, segment.v.data, rows(segment.v));
-}
-
-/// Scores of one tile for a warp's rows, scaled for exponentials of base 2.
-template <class S>
-VLA_DEVICE void score(const std::byte* q_rows, const unsigned (&q)[S::kSteps][4], const std::byte* k,
-                      float (&scores)[S::kKeys / 8][4]) {
-  const int lane = thread_index() % kLanes;
+VLA_DEVICE void fetch_queries(const AttentionJob& job, const Unit& unit, int row0, std::byte* to) {
+  const int column = copied_column<S>(), group = job.group();
+  if (S::kPerRow * 8 > S::kDepth && column >= S::kDepth) return;
+  int row = thread_index() / S::kPerRow, query = (row0 + row) / group, head = (row0 + row) % group;
+  const int query_step = S::kRowStep / group, head_step = S::kRowStep % group;
 #pragma unroll
-  for (int i = 0; i < S::kSteps; ++i) {
-    unsigned a[4] = {q[i][0], q[i][1], q[i][2], q[i][3]};
-    if constexpr (!S::kKeepsQ) dev::load_matrices(a, q_rows + (2 * i + lane / 16) * 16);
-#pragma unroll
-    for (int n = 0; n < S::kKeys / 16; ++n) {
-      unsigned b[4];
-      dev::load_matrices(b, k + (n * 16 + lane / 16 * 8 + lane % 8) * S::kRow + (2 * i + lane / 8 % 2) * 16);
-      dev::multiply_bf16(scores[2 * n], a, b[0], b[1]);
-      dev::multiply_bf16(scores[2 * n + 1], a, b[2], b[3]);
-    }
+  for (int i = 0; i < S::kRows; i += S::kRowStep, row += S::kRowStep) {
+    const bool valid = row0 + row < job.n_row() && column < job.d_head;
+    const std::uint16_t* from = row_of<std::uint16_t>(job.q, unit.head_kv * group + head, query, unit.batch) + column;
+    if (row < S::kRows) dev::copy_async(to + row * S::kRow + column * 2, valid ? from : job.q.data, valid ? 16 : 0);
+    query += query_step, head += head_step;
+    if (head >= group) head -= group, ++query;
   }
 }
 
+/// A warp's part of a block's work. Sums 0 and 1 of a lane belong to row lane / 4 of its 16, sums 2 and 3 to row lane /
+/// 4
+/// + 8.
 template <class S>
-VLA_DEVICE void attend_bf16(const AttentionJob& job) {
-  std::byte *shared = dev::shared_memory(), *stages = shared + kRows * S::kRow;
-  const int lane = thread_index() % kLanes, warp_row = thread_index() / kLanes * 16;
-  const int row0 = static_cast<int>(blockIdx.x) * kRows, n_key = count_keys(job);
-  const Unit unit(job);
-  Tiles<S::kKeys> tile(job), ahead(job);
+class Warp {
+ public:
+  VLA_DEVICE Warp(const AttentionJob& job, const Unit& unit, int n_key)
+      : job_(job), unit_(unit), row0_(static_cast<int>(blockIdx.x) * S::kRows + row_group() * 16), n_key_(n_key) {}
 
-  fetch_rows<S>(shared, kRows, job.n_row() - row0, job.d_head, job.q.data, [&](int row) {
-    return row_of<std::uint16_t>(job.q, head_of(job, unit, row0 + row), query_of(job, row0 + row), unit.batch);
-  });
-  if (ahead.more()) fetch_keys<S>(job, unit, ahead, stages);
-  dev::commit_copies();
+  VLA_DEVICE static int lane() { return thread_index() % kLanes; }
+  VLA_DEVICE static int row_group() { return thread_index() / kLanes % S::kRowGroups; }
+  VLA_DEVICE static int key_group() { return thread_index() / kLanes / S::kRowGroups; }
 
-  // A lane's sums 0 and 1 belong to row lane / 4, sums 2 and 3 to row lane / 4 + 8.
-  const float* mask[2] = {};
-#pragma unroll
-  for (int h = 0; h < 2; ++h) {
-    const int row = row0 + warp_row + lane / 4 + h * 8;
-    if (job.mask) mask[h] = job.mask + static_cast<std::int64_t>(query_of(job, row < job.n_row() ? row : 0)) * n_key;
-  }
-  const float scale = job.scale * kLog2;
-  const std::byte* q_rows = shared + (warp_row + lane % 16) * S::kRow;
-  unsigned q[S::kSteps][4] = {};
-  float y[S::kTiles][4] = {}, most[2] = {kMinusInfinity, kMinusInfinity}, total[2] = {};
-  for (int stage = 0; tile.more(); stage ^= 1, tile.next()) {
-    ahead.next();
-    if (ahead.more()) fetch_keys<S>(job, unit, ahead, stages + (stage ^ 1) * 2 * S::kTile);
-    dev::commit_copies();
-    dev::wait_copies<1>();
-    __syncthreads();  // the tile is visible to all threads
-    const std::byte *k = stages + stage * 2 * S::kTile, *v = k + S::kTile;
-    if (S::kKeepsQ && tile.number < job.n_split) {
-#pragma unroll
-      for (int i = 0; i < S::kSteps; ++i) dev::load_matrices(q[i], q_rows + (2 * i + lane / 16) * 16);
-    }
-
-    float scores[S::kKeys / 8][4] = {};
-    score<S>(q_rows, q, k, scores);
-    const int n_valid = tile.n_key(), first_key = tile.before + tile.first;
-    const auto each = [&](auto change) {  // score, row (0 or 8 below), key in the tile
-#pragma unroll
-      for (int n = 0; n < S::kKeys / 8; ++n)
-#pragma unroll
-        for (int c = 0; c < 4; ++c) change(scores[n][c], c / 2, n * 8 + lane % 4 * 2 + c % 2);
-    };
-    each([&](float& one, int, int) { one *= scale; });
-    if (job.mask)
-      each([&](float& one, int h, int key) { one += mask[h][first_key + (key < n_valid ? key : 0)] * kLog2; });
-    if (n_valid < S::kKeys) each([&](float& one, int, int key) { one = key < n_valid ? one : kMinusInfinity; });
-    float tile_most[2] = {most[0], most[1]};
-    each([&](float& one, int h, int) { tile_most[h] = fmaxf(tile_most[h], one); });
+  /// Scores of keys of the tile from `first` on begin with the mask, and with minus infinity from key `last` on.
+  VLA_DEVICE void begin_scores(int first, int last) {
+    const int key = first + key_group() * S::kOwnKeys + lane() % 4 * 2;
+    const bool is_whole = first + S::kKeys <= last;
+    const float unit = 1 / job_.scale;
 #pragma unroll
     for (int h = 0; h < 2; ++h) {
-      tile_most[h] = fmaxf(tile_most[h], dev::shuffle_xor(tile_most[h], 1));
-      tile_most[h] = fmaxf(tile_most[h], dev::shuffle_xor(tile_most[h], 2));
-      const float factor = shrink(most[h], tile_most[h]);
-      most[h] = tile_most[h], total[h] *= factor;
+      const auto each = [&](auto value) {
 #pragma unroll
-      for (int n = 0; n < S::kTiles; ++n) y[n][2 * h] *= factor, y[n][2 * h + 1] *= factor;
+        for (int n = 0; n < S::kOwnKeys / 8; ++n)
+#pragma unroll
+          for (int c = 0; c < 2; ++c) scores_[n][2 * h + c] = value(key + n * 8 + c);
+      };
+      if (job_.mask == nullptr) {
+        each([&](int at) { return is_whole || at < last ? 0 : kMinusInfinity; });
+      } else {
+        const int row = row0_ + lane() / 4 + h * 8;
+        const float* mask =
+            job_.mask + static_cast<std::int64_t>(row < job_.n_row() ? query_of(job_, row) : 0) * n_key_;
+        each([&](int at) { return at < last ? mask[at] * unit : kMinusInfinity; });
+      }
     }
-    const float base[2] = {finite(most[0]), finite(most[1])};
-    unsigned weights[S::kKeys / 16][4];  // in the register order of operand a
+  }
+  VLA_DEVICE void keep_queries(const std::byte* q) {
+    if constexpr (S::kKeepsQ)
 #pragma unroll
-    for (int n = 0; n < S::kKeys / 8; ++n)
+      for (int i = 0; i < S::kSteps; ++i) load_queries(q_[i], q, i);
+  }
+  /// scores += q k, not scaled yet.
+  VLA_DEVICE void score(const std::byte* q, const std::byte* k) {
+    float odd[S::kOwnKeys / 8][4] = {};
+    k += (key_group() * S::kOwnKeys + lane() / 16 * 8 + lane() % 8) * S::kRow + lane() / 8 % 2 * 16;
 #pragma unroll
-      for (int h = 0; h < 2; ++h) {
-        const float low = dev::power_of_two(scores[n][2 * h] - base[h]),
-                    high = dev::power_of_two(scores[n][2 * h + 1] - base[h]);
-        total[h] += low + high;
-        weights[n / 2][n % 2 * 2 + h] = dev::to_bf16(low, high);
-      }
+    for (int i = 0; i < S::kSteps; ++i) {
+      unsigned a[4];
+      if constexpr (!S::kKeepsQ) load_queries(a, q, i);
+      const unsigned(&of_q)[4] = S::kKeepsQ ? q_[S::kKeepsQ ? i : 0] : a;
+      auto& sums = S::kScoreSums > 1 && i % 2 ? odd : scores_;
 #pragma unroll
-    for (int i = 0; i < S::kKeys / 16; ++i)
-#pragma unroll
-      for (int n = 0; n < S::kTiles; n += 2) {
+      for (int n = 0; n < S::kOwnKeys / 16; ++n) {
         unsigned b[4];
-        dev::load_transposed(b, v + (i * 16 + lane % 16) * S::kRow + (n + lane / 16) * 16);
-        dev::multiply_bf16(y[n], weights[i], b[0], b[1]);
-        dev::multiply_bf16(y[n + 1], weights[i], b[2], b[3]);
+        dev::load_matrices(b, k + n * 16 * S::kRow + i * 32);
+        dev::multiply_bf16(sums[2 * n], of_q, b[0], b[1]);
+        dev::multiply_bf16(sums[2 * n + 1], of_q, b[2], b[3]);
       }
+    }
+    if constexpr (S::kScoreSums > 1) add(scores_, odd);
+  }
+  /// The largest score so far of each row, among this warp's keys of the tile.
+  VLA_DEVICE void find_most(float (&most)[2]) const {
+#pragma unroll
+    for (int h = 0; h < 2; ++h) {
+      most[h] = most_[h];
+#pragma unroll
+      for (int n = 0; n < S::kOwnKeys / 8; ++n)
+        most[h] = fmaxf(most[h], fmaxf(scores_[n][2 * h], scores_[n][2 * h + 1]));
+      most[h] = fmaxf(most[h], dev::shuffle_xor(most[h], 1));
+      most[h] = fmaxf(most[h], dev::shuffle_xor(most[h], 2));
+    }
+  }
+  /// What was summed is weighed anew where the largest score grows to `most`.
+  VLA_DEVICE void shrink_to(const float (&most)[2]) {
+    const float scale = job_.scale * kLog2;
+#pragma unroll
+    for (int h = 0; h < 2; ++h) {
+      const float factor = dev::power_of_two((most_[h] - finite(most[h])) * scale);
+      most_[h] = most[h], total_[h] *= factor;
+#pragma unroll
+      for (int s = 0; s < S::kSums; ++s)
+#pragma unroll
+        for (int n = 0; n < S::kTiles; ++n) y_[s][n][2 * h] *= factor, y_[s][n][2 * h + 1] *= factor;
+    }
+  }
+  /// Weights of this warp's keys, for `take`(tile of 8 keys, row's half, two of bf16).
+  template <class Take>
+  VLA_DEVICE void weigh(Take take) {
+    const float scale = job_.scale * kLog2;
+#pragma unroll
+    for (int h = 0; h < 2; ++h) {
+      const float base = finite(most_[h]) * scale;
+#pragma unroll
+      for (int n = 0; n < S::kOwnKeys / 8; ++n) {
+        const float low = dev::power_of_two(scores_[n][2 * h] * scale - base),
+                    high = dev::power_of_two(scores_[n][2 * h + 1] * scale - base);
+        total_[h] += low + high;
+        take(n, h, dev::to_bf16(low, high));
+      }
+    }
+  }
+  /// y += weights * v, for 16 keys; `v` is where this lane's row of them begins.
+  VLA_DEVICE void add_values(const unsigned (&weights)[4], const std::byte* v) {
+#pragma unroll
+    for (int n = 0; n < S::kTiles; n += 2) {
+      unsigned b[4];
+      dev::load_transposed(b, v + (n + lane() / 16) * 16);
+      dev::multiply_bf16(y_[0][n], weights, b[0], b[1]);
+      dev::multiply_bf16(y_[0][n + 1], weights, b[2], b[3]);
+    }
+  }
+  /// The tile's values, of weights in registers.
+  VLA_DEVICE void add_values_alone(const std::byte* v) {
+    unsigned weights[S::kOwnKeys / 16][4];  // in the order of operand a
+    weigh([&](int n, int h, unsigned pair) { weights[n / 2][n % 2 * 2 + h] = pair; });
+#pragma unroll
+    for (int i = 0; i < S::kOwnKeys / 16; ++i) add_values(weights[i], v + (i * 16 + lane() % 16) * S::kRow);
+  }
+
+  VLA_DEVICE void write_weights(std::byte* to) {
+    to += (row_group() * 16 + lane() / 4) * S::weight_row() + (key_group() * S::kOwnKeys + lane() % 4 * 2) * 2;
+    weigh([&](int n, int h, unsigned pair) { dev::write(to + h * 8 * S::weight_row() + n * 16, pair); });
+  }
+  /// The tile's values in this warp's columns, of weights that all warps left. 64 keys without one are left out.
+  VLA_DEVICE void add_values_shared(const std::byte* weights, const std::byte* v, int n_key) {
+    weights += (row_group() * 16 + lane() % 16) * S::weight_row() + lane() / 16 * 16;
+    v += key_group() * S::kTiles * 16;
+    constexpr int kAtOnce = S::kKeys < 64 ? S::kKeys : 64;
+#pragma unroll
+    for (int first = 0; first < S::kKeys; first += kAtOnce) {
+      if (first > 0 && first >= n_key) break;
+#pragma unroll
+      for (int key = first; key < first + kAtOnce; key += 32) {
+        unsigned a[2][4];
+        dev::load_matrices(a[0], weights + key * 2);
+        dev::load_matrices(a[1], weights + key * 2 + 32);
+        if constexpr (S::kTiles == 1) {
+          unsigned b[4];
+          dev::load_transposed(b, v + (key + lane()) * S::kRow);
+          dev::multiply_bf16(y_[0][0], a[0], b[0], b[1]);
+          dev::multiply_bf16(y_[S::kSums - 1][0], a[1], b[2], b[3]);
+        } else {
+          add_values(a[0], v + (key + lane() % 16) * S::kRow);
+          add_values(a[1], v + (key + 16 + lane() % 16) * S::kRow);
+        }
+      }
+    }
+  }
+
+  /// Every warp of a row group gets what `combine` makes of their values, through a float for each row and key group.
+  /// All threads of the block come to its barrier.
+  template <class Combine>
+  VLA_DEVICE void across_groups(float (&values)[2], std::byte* room, Combine combine) const {
+    room += (row_group() * 16 + lane() / 4) * 4;
+    if (lane() % 4 == 0)
+      for (int h = 0; h < 2; ++h) dev::write(room + (key_group() * S::kRows + h * 8) * 4, values[h]);
+    __syncthreads();  // every warp's values are written
+#pragma unroll
+    for (int h = 0; h < 2; ++h) {
+      values[h] = dev::read<float>(room + h * 32);
+#pragma unroll
+      for (int g = 1; g < S::kGroups; ++g)
+        values[h] = combine(values[h], dev::read<float>(room + (g * S::kRows + h * 8) * 4));
+    }
+  }
+  VLA_DEVICE void finish(std::byte* room) {
+    if constexpr (S::kSums > 1) add(y_[0], y_[1]);
+#pragma unroll
+    for (int h = 0; h < 2; ++h) {
+      total_[h] += dev::shuffle_xor(total_[h], 1);
+      total_[h] += dev::shuffle_xor(total_[h], 2);
+    }
+    if constexpr (S::kShares) across_groups(total_, room, [](float a, float b) { return a + b; });
+#pragma unroll
+    for (int h = 0; h < 2; ++h) store_row(row0_ + lane() / 4 + h * 8, h);
+  }
+
+ private:
+  VLA_DEVICE static void load_queries(unsigned (&a)[4], const std::byte* q, int step) {
+    dev::load_matrices(a, q + (row_group() * 16 + lane() % 16) * S::kRow + (2 * step + lane() / 16) * 16);
+  }
+  template <int n>
+  VLA_DEVICE static void add(float (&to)[n][4], const float (&from)[n][4]) {
+#pragma unroll
+    for (int i = 0; i < n; ++i)
+#pragma unroll
+      for (int c = 0; c < 4; ++c) to[i][c] += from[i][c];
+  }
+  VLA_DEVICE void store_row(int row, int h) const {
+    if (row >= job_.n_row()) return;
+    const int column = key_group() * S::kTiles * 8 + lane() % 4 * 2;
+    if (job_.n_split > 1) {
+      float* partial = partial_row(job_, row, static_cast<int>(blockIdx.z));
+      if (lane() % 4 == 0 && key_group() == 0)
+        partial[job_.d_head] = most_[h] * (job_.scale * kLog2), partial[job_.d_head + 1] = total_[h];
+#pragma unroll
+      for (int n = 0; n < S::kTiles; ++n)
+        if (column + n * 8 < job_.d_head)
+          store_pair(partial, false, column + n * 8, y_[0][n][2 * h], y_[0][n][2 * h + 1]);
+      return;
+    }
+    const std::int64_t at = y_row(job_, unit_, row);
+    const float share = 1 / total_[h];
+#pragma unroll
+    for (int n = 0; n < S::kTiles; ++n)
+      if (column + n * 8 < job_.d_head)
+        store_pair(job_.y, job_.is_bf16, at + column + n * 8, y_[0][n][2 * h] * share, y_[0][n][2 * h + 1] * share);
+  }
+
+  const AttentionJob& job_;
+  const Unit& unit_;
+  int row0_, n_key_;
+  unsigned q_[S::kKeepsQ ? S::kSteps : 1][4] = {};
+  float scores_[S::kOwnKeys / 8][4], y_[S::kSums][S::kTiles][4] = {};
+  float most_[2] = {kMinusInfinity, kMinusInfinity}, total_[2] = {};
+};
+
+/// Each warp takes all keys for its rows; the next tile comes while one is computed.
+template <class S>
+VLA_DEVICE void attend_alone(const AttentionJob& job) {
+  std::byte *q = dev::shared_memory(), *stages = q + S::kRows * S::kRow;
+  const Unit unit(job);
+  const Share share(job);
+  Reader<S, &AttentionJob::Segment::k> keys(job, unit);
+  Reader<S, &AttentionJob::Segment::v> values(job, unit);
+  const auto fetch = [&](int first, int stage) {
+    keys.fetch(first, share.last, stages + stage * 2 * S::kTile);
+    values.fetch(first, share.last, stages + (stage * 2 + 1) * S::kTile);
+  };
+  fetch_queries<S>(job, unit, static_cast<int>(blockIdx.x) * S::kRows, q);
+  if (share.first < share.last) fetch(share.first, 0);
+  dev::commit_copies();
+
+  Warp<S> warp(job, unit, share.n_key);
+  int stage = 0;
+  for (int first = share.first; first < share.last; first += S::kKeys, stage ^= 1) {
+    if (first + S::kKeys < share.last) fetch(first + S::kKeys, stage ^ 1);
+    dev::commit_copies();
+    warp.begin_scores(first, share.last);
+    dev::wait_copies<1>();
+    __syncthreads();  // the tile is visible to all threads
+    if (first == share.first) warp.keep_queries(q);
+    const std::byte* k = stages + stage * 2 * S::kTile;
+    warp.score(q, k);
+    float most[2];
+    warp.find_most(most);
+    warp.shrink_to(most);
+    warp.add_values_alone(k + S::kTile);
     __syncthreads();  // all threads have read the stage that is overwritten next
   }
   dev::wait_copies<0>();
+  warp.finish(nullptr);
+}
 
-#pragma unroll
-  for (int h = 0; h < 2; ++h) {
-    total[h] += dev::shuffle_xor(total[h], 1);
-    total[h] += dev::shuffle_xor(total[h], 2);
-    const int row = row0 + warp_row + lane / 4 + h * 8;
-    if (row >= job.n_row()) continue;
-    float* partial = job.n_split > 1 ? partial_row(job, row, static_cast<int>(blockIdx.z)) : nullptr;
-    if (partial && lane % 4 == 0) partial[job.d_head] = most[h], partial[job.d_head + 1] = total[h];
-#pragma unroll
-    for (int n = 0; n < S::kTiles; ++n)
-#pragma unroll
-      for (int c = 0; c < 2; ++c) {
-        const int i = n * 8 + lane % 4 * 2 + c;
-        if (i >= job.d_head) continue;
-        if (partial)
-          partial[i] = y[n][2 * h + c];
-        else
-          store_y(job, unit, row, i, y[n][2 * h + c] / total[h]);
-      }
+/// Warps share a tile's keys, then the elements of the result. Keys of the next tile come while values are multiplied,
+/// values while scores are computed.
+template <class S>
+VLA_DEVICE void attend_shared(const AttentionJob& job) {
+  std::byte *q = dev::shared_memory(), *k = q + S::kRows * S::kRow, *v = k + S::kTile;
+  std::byte *weights = v + S::kTile, *room = weights + S::kRows * S::weight_row();
+  const Unit unit(job);
+  const Share share(job);
+  Reader<S, &AttentionJob::Segment::k> keys(job, unit);
+  Reader<S, &AttentionJob::Segment::v> values(job, unit);
+  fetch_queries<S>(job, unit, static_cast<int>(blockIdx.x) * S::kRows, q);
+  if (share.first < share.last) keys.fetch(share.first, share.last, k);
+  dev::commit_copies();
+  if (share.first < share.last) values.fetch(share.first, share.last, v);
+  dev::commit_copies();
+
+  Warp<S> warp(job, unit, share.n_key);
+  for (int first = share.first; first < share.last; first += S::kKeys) {
+    const bool is_first = first == share.first;
+    warp.begin_scores(first, share.last);
+    if (is_first)
+      dev::wait_copies<1>();
+    else
+      dev::wait_copies<0>();
+    __syncthreads();  // keys are visible to all threads, which have read the values before
+    if (!is_first) {
+      values.fetch(first, share.last, v);
+      dev::commit_copies();
+    } else {
+      warp.keep_queries(q);
+    }
+    warp.score(q, k);
+    float most[2];
+    warp.find_most(most);
+    warp.across_groups(most, room, [](float a, float b) { return fmaxf(a, b); });
+    if (first + S::kKeys < share.last) keys.fetch(first + S::kKeys, share.last, k);  // after a barrier: all have read k
+    dev::commit_copies();
+    warp.shrink_to(most);
+    warp.write_weights(weights);
+    dev::wait_copies<1>();
+    __syncthreads();  // values and weights are visible to all threads
+    warp.add_values_shared(weights, v, share.last - first);
   }
+  dev::wait_copies<0>();
+  warp.finish(room);
+}
+
+template <int kIndex>
+VLA_DEVICE void attend_bf16(const AttentionJob& job) {
+  if constexpr (Shape<kIndex>::kShares)
+    attend_shared<Shape<kIndex>>(job);
+  else
+    attend_alone<Shape<kIndex>>(job);
 }
 
 }  // namespace
 
-using Shape64 = Shape<64>;
-using Shape80 = Shape<80>;
-using Shape128 = Shape<128>;
-using Shape256 = Shape<256>;
-
-VLA_KERNEL(attention_bf16_64, 128, 2, AttentionJob) { attend_bf16<Shape64>(job); }
-VLA_KERNEL(attention_bf16_80, 128, 1, AttentionJob) { attend_bf16<Shape80>(job); }
-VLA_KERNEL(attention_bf16_128, 128, 1, AttentionJob) { attend_bf16<Shape128>(job); }
-VLA_KERNEL(attention_bf16_256, 128, 1, AttentionJob) { attend_bf16<Shape256>(job); }
+// In the order of kAttentionShapes.
+VLA_KERNEL(attention_bf16_64, 128, 3, AttentionJob) { attend_bf16<0>(job); }
+VLA_KERNEL(attention_bf16_64_32, 256, 2, AttentionJob) { attend_bf16<1>(job); }
+VLA_KERNEL(attention_bf16_64_16, 256, 2, AttentionJob) { attend_bf16<2>(job); }
+VLA_KERNEL(attention_bf16_80, 128, 2, AttentionJob) { attend_bf16<3>(job); }
+VLA_KERNEL(attention_bf16_128, 128, 2, AttentionJob) { attend_bf16<4>(job); }
+VLA_KERNEL(attention_bf16_128_32, 256, 2, AttentionJob) { attend_bf16<5>(job); }
+VLA_KERNEL(attention_bf16_128_16, 256, 2, AttentionJob) { attend_bf16<6>(job); }
+VLA_KERNEL(attention_bf16_256, 256, 1, AttentionJob) { attend_bf16<7>(job); }
+VLA_KERNEL(attention_bf16_256_32, 256, 2, AttentionJob) { attend_bf16<8>(job); }
 
 /// A warp computes one row, a block eight. A lane has one key while scores are computed, then every 32nd element of y.
 VLA_KERNEL(attention_f32, 256, 2, AttentionJob) {
@@ -313,25 +565,41 @@ VLA_KERNEL(attention_f32, 256, 2, AttentionJob) {
   }
 }
 
-/// Combines the partial sums of a split; a warp computes one row.
-VLA_KERNEL(attention_finish, 128, 4, AttentionJob) {
-  const int lane = thread_index() % kLanes, row = static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes;
+/// Combines the partial sums of a split; a warp computes 64 elements of a row. Lane z weighs share z.
+VLA_KERNEL(attention_finish, 128, 8, AttentionJob) {
+  constexpr int kAtOnce = 16;  // shares that are on their way at a time
+  const int lane = thread_index() % kLanes, n_part = (job.d_head + 63) / 64;
+  const int warp = static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes, row = warp / n_part;
   const Unit unit(job);
   if (row >= job.n_row()) return;
-  float most = kMinusInfinity, total = 0;
-  for (int z = 0; z < job.n_split; ++z) most = fmaxf(most, partial_row(job, row, z)[job.d_head]);
-  for (int z = 0; z < job.n_split; ++z) {
-    const float* partial = partial_row(job, row, z);
-    total += partial[job.d_head + 1] * weight_of(partial[job.d_head], most);
-  }
-  for (int i = lane; i < job.d_head; i += kLanes) {
-    float sum = 0;
-    for (int z = 0; z < job.n_split; ++z) {
-      const float* partial = partial_row(job, row, z);
-      sum += partial[i] * weight_of(partial[job.d_head], most);
+  const int i = warp % n_part * 64 + lane;
+  const std::int64_t stride = partial_row(job, row, 1) - partial_row(job, row, 0);
+  const float* partial = partial_row(job, row, 0);
+  float most = kMinusInfinity, total = 0, sums[2] = {};
+  if (lane < job.n_split) most = partial[lane * stride + job.d_head], total = partial[lane * stride + job.d_head + 1];
+  for (int first = 0; first < job.n_split; first += kAtOnce) {
+    float values[kAtOnce][2];
+#pragma unroll
+    for (int z = 0; z < kAtOnce; ++z)
+#pragma unroll
+      for (int j = 0; j < 2; ++j)
+        values[z][j] =
+            first + z < job.n_split && i + j * 32 < job.d_head ? partial[(first + z) * stride + i + j * 32] : 0;
+    if (first == 0) {
+      float all = most;
+      for (int mask = 16; mask > 0; mask /= 2) all = fmaxf(all, dev::shuffle_xor(all, mask));
+      most = weight_of(most, all), total = sum_of_warp(total * most);  // most: the share's weight from here on
     }
-    store_y(job, unit, row, i, sum / total);
+#pragma unroll
+    for (int z = 0; z < kAtOnce; ++z) {
+      const float weight = dev::shuffle(most, first + z);
+#pragma unroll
+      for (int j = 0; j < 2; ++j) sums[j] += values[z][j] * weight;
+    }
   }
+#pragma unroll
+  for (int j = 0; j < 2; ++j)
+    if (i + j * 32 < job.d_head) store_y(job, unit, row, i + j * 32, sums[j] / total);
 }
 
 }  // namespace vla::cuda

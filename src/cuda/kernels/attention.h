@@ -25,9 +25,9 @@ struct AttentionJob {
   Segment segment[kMaxSegment];
   const float* mask;  // [n_key, n_query], any values except +infinity, or null
   void* y;            // [d_head, n_head, n_query, n_batch], float32 or bf16
-  /// With more than one split each takes a share of the keys. Sums of values, and for every row its largest score and
-  /// sum of weights, go to partial [d_head + 2, n_row, n_head_kv * n_batch, n_split]; `finish_attention` computes y
-  /// from them.
+  /// With more than one split, of kMaxAttentionSplit, each takes a share of the keys. Sums of values, and for every row
+  /// its largest score and sum of weights, go to partial [d_head + 2, n_row, n_head_kv * n_batch, n_split];
+  /// `finish_attention` computes y from them.
   float* partial;
   float scale;
   int n_segment, n_query, n_head, n_head_kv, n_batch, d_head, n_split;
@@ -39,21 +39,43 @@ struct AttentionJob {
 };
 
 constexpr int kMaxHead = 256;
+constexpr int kMaxAttentionSplit = 32;
 
-/// On tensor cores: q, k and v are bf16; d_head and all strides are multiples of 8. Weights are rounded to bf16, sums
-/// and softmax are float32.
-inline Launch attention_bf16(const AttentionJob& job) {
-  const int depth = job.d_head <= 64 ? 64 : job.d_head <= 80 ? 80 : job.d_head <= 128 ? 128 : 256;
-  const char* name = depth == 64    ? "attention_bf16_64"
-                     : depth == 80  ? "attention_bf16_80"
-                     : depth == 128 ? "attention_bf16_128"
-                                    : "attention_bf16_256";
-  const int n_key = depth == 256 ? 32 : 64;  // of a tile
-  return {
-      name,
-      {blocks(job.n_row(), 64), static_cast<unsigned>(job.n_head_kv * job.n_batch), static_cast<unsigned>(job.n_split)},
-      128,
-      static_cast<unsigned>((64 + 4 * n_key) * (depth * 2 + 16))};
+/// A block of a kernel on tensor cores: `rows` rows of queries, 16 of each warp, and a tile of `keys` keys at a time.
+/// One key group: a warp takes all keys of a tile, and the next tile comes meanwhile. More: warps share the keys while
+/// they compute scores, then the elements of the result, for few rows.
+struct AttentionShape {
+  const char* kernel;
+  int depth;  // of heads, at most
+  int rows, key_groups, keys;
+
+  constexpr int n_thread() const { return rows / 16 * key_groups * 32; }
+  /// Bytes of a row of queries, keys or values in shared memory, and of weights. They are padded by 16 bytes, so that
+  /// the eight rows of a matrix load are in different banks.
+  constexpr int row() const { return depth * 2 + 16; }
+  constexpr int weight_row() const { return keys * 2 + 16; }
+  constexpr int stages() const { return key_groups == 1 ? 2 : 1; }
+  constexpr int shared() const {
+    const int exchanged = key_groups == 1 ? 0 : rows * (weight_row() + 4 * key_groups);
+    return (rows + stages() * 2 * keys) * row() + exchanged;
+  }
+};
+constexpr AttentionShape kAttentionShapes[] = {
+    {"attention_bf16_64", 64, 64, 1, 64},       {"attention_bf16_64_32", 64, 32, 4, 256},
+    {"attention_bf16_64_16", 64, 16, 8, 256},   {"attention_bf16_80", 80, 64, 1, 64},
+    {"attention_bf16_128", 128, 64, 1, 64},     {"attention_bf16_128_32", 128, 32, 4, 128},
+    {"attention_bf16_128_16", 128, 16, 8, 128}, {"attention_bf16_256", 256, 64, 2, 32},
+    {"attention_bf16_256_32", 256, 32, 4, 64},
+};
+
+/// On tensor cores: q, k and v are bf16; d_head, at most shape.depth, and all strides are multiples of 8. Weights are
+/// rounded to bf16, sums and softmax are float32.
+inline Launch attention_bf16(const AttentionShape& shape, const AttentionJob& job) {
+  return {shape.kernel,
+          {blocks(job.n_row(), shape.rows), static_cast<unsigned>(job.n_head_kv * job.n_batch),
+           static_cast<unsigned>(job.n_split)},
+          static_cast<unsigned>(shape.n_thread()),
+          static_cast<unsigned>(shape.shared())};
 }
 /// In float32, for any d_head.
 inline Launch attention_f32(const AttentionJob& job) {
@@ -64,7 +86,8 @@ inline Launch attention_f32(const AttentionJob& job) {
       static_cast<unsigned>((2 * 32 + 8) * (round_up(job.d_head, 32) + 1) * 4)};
 }
 inline Launch finish_attention(const AttentionJob& job) {
-  return {"attention_finish", {blocks(job.n_row(), 4), static_cast<unsigned>(job.n_head_kv * job.n_batch)}, 128};
+  const std::int64_t n_warp = static_cast<std::int64_t>(job.n_row()) * blocks(job.d_head, 64);
+  return {"attention_finish", {blocks(n_warp, 4), static_cast<unsigned>(job.n_head_kv * job.n_batch)}, 128};
 }
 
 }  // namespace vla::cuda

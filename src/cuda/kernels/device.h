@@ -134,6 +134,14 @@ VLA_DEVICE void store(void* y, bool is_bf16, std::int64_t at, float value) {
     static_cast<float*>(y)[at] = value;
 }
 
+/// Elements `at`, which is even, and at + 1.
+VLA_DEVICE void store_pair(void* y, bool is_bf16, std::int64_t at, float low, float high) {
+  if (is_bf16)
+    *reinterpret_cast<unsigned*>(static_cast<std::uint16_t*>(y) + at) = dev::to_bf16(low, high);
+  else
+    *reinterpret_cast<float2*>(static_cast<float*>(y) + at) = {low, high};
+}
+
 /// Reduces over the lanes of a warp, with the result in all of them, in the same order everywhere.
 VLA_DEVICE float sum_of_warp(float x) {
   for (int mask = 16; mask > 0; mask /= 2) x += dev::shuffle_xor(x, mask);

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include "cuda/kernels/attention.h"
 #include "lower/cuda/cuda_queue.h"
 #include "lower/cuda/cuda_weights.h"
 #include "lower/ops.h"
@@ -54,6 +55,16 @@ void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 /// How blocks of a product cut rows: in 128, in 64, or few rows bound by reading the matrix.
 enum class ProductShape { few, rows64, rows128 };
 ProductShape product_shape(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, int n_sm);
+
+/// How blocks on tensor cores cut rows of queries and shares of keys.
+struct AttentionPlan {
+  const cuda::AttentionShape* shape;
+  int n_split;
+};
+/// The fastest by estimates. n_row: of each of n_unit heads of keys in a batch.
+AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key,
+                             int n_sm);
+AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op);
 
 /// As Program::work counts it.
 Work work_of(const CudaLowering& l, const CudaOp& op);
