@@ -56,7 +56,7 @@ vulkan: build
 # libvla-cuda.so for build/cpu. With GGML=1 also ggml's backend.
 cuda: build
 	cmake build/cpu -DVLA_CUDA=ON -DVLA_CUDA_GGML=$(if $(GGML),ON,OFF) >/dev/null
-	cmake --build --preset cpu --target vla_cuda bench_products test_kernels_gpu $(if $(GGML),vla_cuda_ggml)
+	cmake --build --preset cpu --target vla_cuda bench_products bench_attention_gpu test_kernels_gpu $(if $(GGML),vla_cuda_ggml)
 
 # What a machine with NVIDIA's driver and Python needs to try a board, in one archive.
 gpu-kit: cuda

@@ -41,7 +41,8 @@ def copy_programs(build, kit):
     """Programs without symbols, libraries that they are linked to, and what runs them and PyTorch from Python."""
     for folder in ("bin", "lib", "runtime", "ptx"):
         (kit / folder).mkdir()
-    files = [build / "bin/vla", build / "bin/bench_products", build / "bin/test_kernels_gpu", build / "lib/libvla.so.1", build / "lib/libvla-cuda.so"]
+    programs = [build / "bin" / name for name in ("vla", "bench_products", "bench_attention_gpu", "test_kernels_gpu")]
+    files = [*programs, build / "lib/libvla.so.1", build / "lib/libvla-cuda.so"]
     for file in files:
         if not file.is_file():
             sys.exit(f"error: {file}: expected what make cuda builds, found nothing")

@@ -16,7 +16,7 @@ OUT/result.json is the result, OUT/log.txt all that was said. The stages, in ord
     families   acts of policies of their published sizes, with random weights, and what was predicted where there is a model of this GPU;
                each kernel of an act, where this Python has PyTorch
     torch      LeRobot's own networks at the same sizes, where the Python of --torch has PyTorch and LeRobot
-    products   matrix products in all shapes of blocks, and cuBLAS where this Python has PyTorch
+    products   matrix products and attention in all shapes of blocks, and cuBLAS where this Python has PyTorch
     cpu        the same acts on this machine's processor
 
 Where devices, act or kernels fail, each call of the driver is tried by itself instead, and the other stages do not run."""
@@ -263,6 +263,8 @@ def products(visit):
         key = row["kind"], row["rows"], row["depth"], row["columns"]
         fastest[key] = min(row, fastest.get(key, row), key=lambda one: one["us"])
     visit.result["products"] = list(fastest.values())
+    out = visit.step("attention in all shapes of blocks", [KIT / "bin/bench_attention_gpu", *sizes], 120)
+    visit.result["attention"] = out and [json.loads(line) for line in out.splitlines()]
     if has_torch(visit):
         sizes = json.dumps(sorted({key[1:] for key in fastest}))
         out = visit.step("products of cuBLAS", [visit.options.torch, KIT / "cublas.py", sizes], 150)

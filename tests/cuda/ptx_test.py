@@ -11,7 +11,7 @@ import pytest
 from conftest import run_tests
 
 # Tensor instructions of a step of the main loop, on every architecture. The warp has 64 x 64 sums in the shapes of 128,
-# 32 x 32 in those of 64, in products of 16 x 8; attention has 16 rows, and 64 keys or 32 of them for heads of 256.
+# 32 x 32 in those of 64, in products of 16 x 8; attention has 16 rows, and the keys and elements of attention.h.
 MAIN_LOOPS = {
     "linear_ternary_128": ("IMMA.16832.S8.S8", 64),
     "linear_ternary_64": ("IMMA.16832.S8.S8", 16),
@@ -20,9 +20,14 @@ MAIN_LOOPS = {
     "linear_bf16_128": ("HMMA.16816.F32.BF16", 64),
     "linear_bf16_64": ("HMMA.16816.F32.BF16", 16),
     "attention_bf16_64": ("HMMA.16816.F32.BF16", 64),
+    "attention_bf16_64_32": ("HMMA.16816.F32.BF16", 64),
+    "attention_bf16_64_16": ("HMMA.16816.F32.BF16", 32),
     "attention_bf16_80": ("HMMA.16816.F32.BF16", 80),
     "attention_bf16_128": ("HMMA.16816.F32.BF16", 128),
-    "attention_bf16_256": ("HMMA.16816.F32.BF16", 128),
+    "attention_bf16_128_32": ("HMMA.16816.F32.BF16", 64),
+    "attention_bf16_128_16": ("HMMA.16816.F32.BF16", 32),
+    "attention_bf16_256": ("HMMA.16816.F32.BF16", 64),
+    "attention_bf16_256_32": ("HMMA.16816.F32.BF16", 64),
 }
 # An architecture takes ptxas and nvdisasm seven seconds.
 ARCHITECTURES = cuda_kernels.ARCHITECTURES if os.environ.get("VLA_ALL_ARCHITECTURES") else (87,)

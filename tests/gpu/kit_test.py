@@ -27,7 +27,7 @@ def kit(tmp_path_factory):
     kit = tmp_path_factory.mktemp("kit") / pack.NAME
     for folder in ("bin", "lib", "ptx"):
         (kit / folder).mkdir(parents=True)
-    for file in (BINARY, BINARY.parent / "libvla.so.1", BINARY.parent / "libvla-cuda.so", PROGRAMS / "bench_products", PROGRAMS / "test_kernels_gpu"):
+    for file in (BINARY, BINARY.parent / "libvla.so.1", BINARY.parent / "libvla-cuda.so", PROGRAMS / "bench_products", PROGRAMS / "bench_attention_gpu", PROGRAMS / "test_kernels_gpu"):
         shutil.copy(file, kit / "bin")
     pack.copy_tiny(kit / "bin/vla", kit)
     pack.copy_cases(kit, ["act/environment"])
@@ -54,6 +54,7 @@ def test_the_kit_tells_that_kernels_run_and_are_right_and_what_they_take(kit, tm
     assert family["stored"]["ms"]["network"] > 0 and family["int8"]["ms"]["network"] > 0
     assert family["predicted"]["model"] == "h100" and family["predicted"]["ms"]["steps"] > 0
     assert {row["kind"] for row in found["products"]} == {"bf16", "ternary", "int8"}
+    assert {row["kernel"] for row in found["attention"]} >= {"attention_bf16_64", "attention_f32"}
     with pytest.raises(SystemExit, match="driver of tests"):
         gpu_table.keep(tmp_path, tmp_path / "result.json")
 

@@ -108,10 +108,21 @@ struct Shape {
 
   // Threads that copy a row, 16 bytes each: a power of two, so that each keeps its column.
   static constexpr int kPerRow = kDepth == 80 ? 16 : kDepth / 8, kRowStep = kThreads / kPerRow;
+  /// The first row that this thread copies, and its column.
+  VLA_DEVICE static int copied_row() { return thread_index() / kPerRow; }
+  VLA_DEVICE static int copied_column() { return thread_index() % kPerRow * 8; }
 };
+
+/// Writes zeros to rows `begin` to end - 1, in this thread's columns.
 template <class S>
-VLA_DEVICE int copied_column() {
-  return thread_index() % S::kPerRow * 8;
+VLA_DEVICE void clear_rows(int begin, int end, std::byte* to) {
+  for (int row = S::copied_row(); row < end; row += S::kRowStep)
+    if (row >= begin) dev::write(to + row * S::kRow + S::copied_column() * 2, uint4{0, 0, 0, 0});
+}
+/// Writes zeros behind d_head, where nothing is copied to.
+template <class S>
+VLA_DEVICE void clear_columns(int d_head, int n_row, std::byte* to) {
+  if (S::copied_column() >= d_head && S::copied_column() < S::kDepth) clear_rows<S>(0, n_row, to);
 }
 
 /// Copies a tile's keys or values to shared memory, which lie in one segment after the other.
@@ -123,59 +134,54 @@ class Reader {
   /// Rows of keys `first` to last - 1, as many as a tile has, and zeros behind them.
   VLA_DEVICE void fetch(int first, int last, std::byte* to) {
     const int n = last - first < S::kKeys ? last - first : S::kKeys;
-    for (int end = 0; end < S::kKeys;) {
-      const bool has_keys = end < n;
-      if (has_keys && end_ <= first + end) {
-        enter(segment_ + 1);
-        continue;
-      }
+    for (int end = 0; end < n;) {
+      while (end_ <= first + end) enter(segment_ + 1);
       const int begin = end;
-      end = !has_keys ? S::kKeys : end_ - first < n ? end_ - first : n;
-      copy(begin, end, from_ + (has_keys ? (first - begin_) * token_ : 0), has_keys ? token_ : 0, has_keys ? size_ : 0,
-           to);
+      end = end_ - first < n ? end_ - first : n;
+      copy(begin, end, from_ + (first - begin_) * token_, to);
     }
+    if (n < S::kKeys && S::copied_column() < job_.d_head) clear_rows<S>(n, S::kKeys, to);
   }
 
  private:
   VLA_DEVICE void enter(int segment) {
     const HeadRows& rows = job_.segment[segment].*kWhich;
-    const int column = copied_column<S>();
     segment_ = segment, begin_ = end_, end_ += job_.segment[segment].n_key, token_ = rows.token;
-    size_ = column < job_.d_head ? 16 : 0;
-    from_ = row_of<std::uint16_t>(rows, unit_.head_kv, 0, unit_.batch) + (size_ ? column : 0);
+    from_ = row_of<std::uint16_t>(rows, unit_.head_kv, 0, unit_.batch);
   }
   /// Rows `begin` to end - 1 of a tile. `from` is where its first row would be.
-  VLA_DEVICE static void copy(int begin, int end, const std::uint16_t* from, std::int64_t token, int size,
-                              std::byte* to) {
-    const int row = thread_index() / S::kPerRow, column = copied_column<S>();
-    if (S::kPerRow * 8 > S::kDepth && column >= S::kDepth) return;
-    from += row * token, to += row * S::kRow + column * 2;
+  VLA_DEVICE void copy(int begin, int end, const std::uint16_t* from, std::byte* to) const {
+    const int row = S::copied_row(), column = S::copied_column();
+    if (column >= job_.d_head) return;
+    from += row * token_ + column, to += row * S::kRow + column * 2;
 #pragma unroll
-    for (int i = 0; i < S::kKeys; i += S::kRowStep, from += S::kRowStep * token)
-      if (row + i >= begin && row + i < end) dev::copy_async(to + i * S::kRow, from, size);
+    for (int i = 0; i < S::kKeys; i += S::kRowStep, from += S::kRowStep * token_)
+      if (row + i >= begin && row + i < end) dev::copy_async(to + i * S::kRow, from, 16);
   }
 
   const AttentionJob& job_;
   const Unit& unit_;
-  const std::uint16_t* from_ = nullptr;  // this thread's column of the segment's first row
+  const std::uint16_t* from_ = nullptr;  // the segment's first row
   std::int64_t token_ = 0;
-  int segment_ = 0, begin_ = 0, end_ = 0, size_ = 0;
+  int segment_ = 0, begin_ = 0, end_ = 0;
 };
 
 /// Copies a block's rows of queries, and zeros behind the last.
 template <class S>
 VLA_DEVICE void fetch_queries(const AttentionJob& job, const Unit& unit, int row0, std::byte* to) {
-  const int column = copied_column<S>(), group = job.group();
-  if (S::kPerRow * 8 > S::kDepth && column >= S::kDepth) return;
-  int row = thread_index() / S::kPerRow, query = (row0 + row) / group, head = (row0 + row) % group;
+  const int column = S::copied_column(), group = job.group();
+  const int n = job.n_row() - row0 < S::kRows ? job.n_row() - row0 : S::kRows;
+  int query = (row0 + S::copied_row()) / group, head = (row0 + S::copied_row()) % group;
   const int query_step = S::kRowStep / group, head_step = S::kRowStep % group;
-#pragma unroll
-  for (int i = 0; i < S::kRows; i += S::kRowStep, row += S::kRowStep) {
-    const bool valid = row0 + row < job.n_row() && column < job.d_head;
-    const std::uint16_t* from = row_of<std::uint16_t>(job.q, unit.head_kv * group + head, query, unit.batch) + column;
-    if (row < S::kRows) dev::copy_async(to + row * S::kRow + column * 2, valid ? from : job.q.data, valid ? 16 : 0);
-    query += query_step, head += head_step;
-    if (head >= group) head -= group, ++query;
+  if (column < job.d_head) {
+    for (int row = S::copied_row(); row < n; row += S::kRowStep) {
+      const int of_group = unit.head_kv * group + head;
+      dev::copy_async(to + row * S::kRow + column * 2,
+                      row_of<std::uint16_t>(job.q, of_group, query, unit.batch) + column, 16);
+      query += query_step, head += head_step;
+      if (head >= group) head -= group, ++query;
+    }
+    clear_rows<S>(n, S::kRows, to);
   }
 }
 
@@ -186,7 +192,14 @@ template <class S>
 class Warp {
  public:
   VLA_DEVICE Warp(const AttentionJob& job, const Unit& unit, int n_key)
-      : job_(job), unit_(unit), row0_(static_cast<int>(blockIdx.x) * S::kRows + row_group() * 16), n_key_(n_key) {}
+      : job_(job), unit_(unit), row0_(static_cast<int>(blockIdx.x) * S::kRows + row_group() * 16) {
+    if (job.mask == nullptr) return;
+#pragma unroll
+    for (int h = 0; h < 2; ++h) {
+      const int row = row0_ + lane() / 4 + h * 8;
+      mask_[h] = job.mask + static_cast<std::int64_t>(row < job.n_row() ? query_of(job, row) : 0) * n_key;
+    }
+  }
 
   VLA_DEVICE static int lane() { return thread_index() % kLanes; }
   VLA_DEVICE static int row_group() { return thread_index() / kLanes % S::kRowGroups; }
@@ -194,26 +207,19 @@ class Warp {
 
   /// Scores of keys of the tile from `first` on begin with the mask, and with minus infinity from key `last` on.
   VLA_DEVICE void begin_scores(int first, int last) {
-    const int key = first + key_group() * S::kOwnKeys + lane() % 4 * 2;
-    const bool is_whole = first + S::kKeys <= last;
-    const float unit = 1 / job_.scale;
-#pragma unroll
-    for (int h = 0; h < 2; ++h) {
-      const auto each = [&](auto value) {
-#pragma unroll
-        for (int n = 0; n < S::kOwnKeys / 8; ++n)
-#pragma unroll
-          for (int c = 0; c < 2; ++c) scores_[n][2 * h + c] = value(key + n * 8 + c);
-      };
-      if (job_.mask == nullptr) {
-        each([&](int at) { return is_whole || at < last ? 0 : kMinusInfinity; });
-      } else {
-        const int row = row0_ + lane() / 4 + h * 8;
-        const float* mask =
-            job_.mask + static_cast<std::int64_t>(row < job_.n_row() ? query_of(job_, row) : 0) * n_key_;
-        each([&](int at) { return at < last ? mask[at] * unit : kMinusInfinity; });
-      }
+    const int key = key_group() * S::kOwnKeys + lane() % 4 * 2, n_key = last - first - key;
+    if (job_.mask == nullptr) {
+      const bool is_whole = last - first >= S::kKeys;
+      each_score([&](float& one, int, int at) { one = is_whole || at < n_key ? 0 : kMinusInfinity; });
+    } else {
+      const float* mask[2] = {mask_[0] + first + key, mask_[1] + first + key};
+      each_score([&](float& one, int h, int at) { one = at < n_key ? mask[h][at] : kMinusInfinity; });
     }
+  }
+  /// The mask as scores are before they are scaled; apart, so that its values come meanwhile.
+  VLA_DEVICE void unscale_mask() {
+    const float unit = 1 / job_.scale;
+    if (job_.mask != nullptr) each_score([&](float& one, int, int) { one *= unit; });
   }
   VLA_DEVICE void keep_queries(const std::byte* q) {
     if constexpr (S::kKeepsQ)
@@ -358,6 +364,14 @@ class Warp {
   }
 
  private:
+  /// change(score, row's half, key behind the lane's first)
+  template <class Change>
+  VLA_DEVICE void each_score(Change change) {
+#pragma unroll
+    for (int n = 0; n < S::kOwnKeys / 8; ++n)
+#pragma unroll
+      for (int c = 0; c < 4; ++c) change(scores_[n][c], c / 2, n * 8 + c % 2);
+  }
   VLA_DEVICE static void load_queries(unsigned (&a)[4], const std::byte* q, int step) {
     dev::load_matrices(a, q + (row_group() * 16 + lane() % 16) * S::kRow + (2 * step + lane() / 16) * 16);
   }
@@ -391,7 +405,8 @@ class Warp {
 
   const AttentionJob& job_;
   const Unit& unit_;
-  int row0_, n_key_;
+  int row0_;
+  const float* mask_[2] = {};  // of a lane's rows
   unsigned q_[S::kKeepsQ ? S::kSteps : 1][4] = {};
   float scores_[S::kOwnKeys / 8][4], y_[S::kSums][S::kTiles][4] = {};
   float most_[2] = {kMinusInfinity, kMinusInfinity}, total_[2] = {};
@@ -409,6 +424,7 @@ VLA_DEVICE void attend_alone(const AttentionJob& job) {
     keys.fetch(first, share.last, stages + stage * 2 * S::kTile);
     values.fetch(first, share.last, stages + (stage * 2 + 1) * S::kTile);
   };
+  clear_columns<S>(job.d_head, S::kRows + 4 * S::kKeys, q);
   fetch_queries<S>(job, unit, static_cast<int>(blockIdx.x) * S::kRows, q);
   if (share.first < share.last) fetch(share.first, 0);
   dev::commit_copies();
@@ -422,6 +438,7 @@ VLA_DEVICE void attend_alone(const AttentionJob& job) {
     dev::wait_copies<1>();
     __syncthreads();  // the tile is visible to all threads
     if (first == share.first) warp.keep_queries(q);
+    warp.unscale_mask();
     const std::byte* k = stages + stage * 2 * S::kTile;
     warp.score(q, k);
     float most[2];
@@ -444,6 +461,7 @@ VLA_DEVICE void attend_shared(const AttentionJob& job) {
   const Share share(job);
   Reader<S, &AttentionJob::Segment::k> keys(job, unit);
   Reader<S, &AttentionJob::Segment::v> values(job, unit);
+  clear_columns<S>(job.d_head, S::kRows + 2 * S::kKeys, q);
   fetch_queries<S>(job, unit, static_cast<int>(blockIdx.x) * S::kRows, q);
   if (share.first < share.last) keys.fetch(share.first, share.last, k);
   dev::commit_copies();
@@ -465,6 +483,7 @@ VLA_DEVICE void attend_shared(const AttentionJob& job) {
     } else {
       warp.keep_queries(q);
     }
+    warp.unscale_mask();
     warp.score(q, k);
     float most[2];
     warp.find_most(most);
@@ -566,7 +585,7 @@ VLA_KERNEL(attention_f32, 256, 2, AttentionJob) {
 }
 
 /// Combines the partial sums of a split; a warp computes 64 elements of a row. Lane z weighs share z.
-VLA_KERNEL(attention_finish, 128, 8, AttentionJob) {
+VLA_KERNEL(attention_finish, 128, 4, AttentionJob) {
   constexpr int kAtOnce = 16;  // shares that are on their way at a time
   const int lane = thread_index() % kLanes, n_part = (job.d_head + 63) / 64;
   const int warp = static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes, row = warp / n_part;

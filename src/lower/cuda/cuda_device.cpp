@@ -5,13 +5,14 @@
 #include <algorithm>
 #include <limits>
 
-#include "lower/cpu/precision.h"
 #include "lower/cuda/cuda_program.h"
 
 namespace vla::lower {
 namespace {
 
 constexpr std::int64_t kNoLimit = std::numeric_limits<std::int64_t>::max();
+/// Attention over fewer keys mixes so few values that their errors hardly cancel, and takes little time in float32.
+constexpr std::int64_t kMinRoundedKeys = 32;
 
 /// Kernels that round x norm it on the way.
 Multiplier multiplier_of(const CudaWeight& weight) {
@@ -44,9 +45,9 @@ Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan& pl
   queue_->set_dry(!fill);
   arena_.reset();  // it may be that of a dry load
   VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, plan, queue_));
-  // Attention rounds where products do, as on the CPU.
+  // Attention rounds where products do.
   const bool rounds = weights_.has(MatrixKind::bf16) || weights_.has(MatrixKind::int8);
-  min_rounded_keys_ = rounds ? vla::min_rounded_keys(params) : kNoLimit;
+  min_rounded_keys_ = rounds ? kMinRoundedKeys : kNoLimit;
   return {};
 }
 

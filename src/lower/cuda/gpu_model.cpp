@@ -65,8 +65,8 @@ constexpr GpuModel kModels[] = {
 // the smallest kernel from its first block to its last, in cycles; how long memory takes to answer.
 constexpr double kIssue = 0.75, kKernelCycles = 4000, kMemoryLatency = 0.8 * kMicro;
 
-/// The main loop of a kernel on tensor cores, whose blocks have a warp for each quarter of an SM. The counts are of
-/// machine code for sm_90 (scripts/cuda_kernels.py cubins; tests/cuda/ptx_test.py compares); attention's have the
+/// The main loop of a kernel on tensor cores, whose blocks have a warp or two for each quarter of an SM. The counts are
+/// of machine code for sm_90 (scripts/cuda_kernels.py cubins; tests/cuda/ptx_test.py compares); attention's have the
 /// branch of a mask in them.
 struct Loop {
   const char* kernel;
@@ -74,6 +74,7 @@ struct Loop {
   int registers;             // of a thread
   int step;                  // elements of the depth, or keys
   int stage, n_stage;        // bytes that a step reads, and steps that there is shared memory for
+  int n_warp = 4;            // of a block
 };
 constexpr Loop kLoops[] = {
     {"linear_bf16_64", 167, 16, 90, 32, 2 * 64 * 64, 4},
@@ -82,10 +83,15 @@ constexpr Loop kLoops[] = {
     {"linear_ternary_128", 228, 64, 204, 64, 128 * (64 + 16), 4},
     {"linear_int8_64", 98, 16, 96, 64, 2 * 64 * 64, 3},
     {"linear_int8_128", 200, 64, 238, 64, 2 * 128 * 64, 3},
-    {"attention_bf16_64", 1270, 64, 168, 64, 2 * 64 * (2 * 64 + 16), 2},
-    {"attention_bf16_80", 1301, 80, 199, 64, 2 * 64 * (2 * 80 + 16), 2},
-    {"attention_bf16_128", 1404, 128, 229, 64, 2 * 64 * (2 * 128 + 16), 2},
-    {"attention_bf16_256", 1276, 128, 243, 32, 2 * 32 * (2 * 256 + 16), 2},
+    {"attention_bf16_64", 762, 64, 161, 64, 2 * 64 * (2 * 64 + 16), 2},
+    {"attention_bf16_64_32", 879, 64, 123, 256, 256 * (2 * 64 + 16), 2, 8},
+    {"attention_bf16_64_16", 687, 32, 108, 256, 256 * (2 * 64 + 16), 2, 8},
+    {"attention_bf16_80", 832, 80, 185, 64, 2 * 64 * (2 * 80 + 16), 2},
+    {"attention_bf16_128", 944, 128, 224, 64, 2 * 64 * (2 * 128 + 16), 2},
+    {"attention_bf16_128_32", 713, 64, 127, 128, 128 * (2 * 128 + 16), 2, 8},
+    {"attention_bf16_128_16", 592, 32, 116, 128, 128 * (2 * 128 + 16), 2, 8},
+    {"attention_bf16_256", 619, 64, 163, 32, 32 * (2 * 256 + 16), 2, 8},
+    {"attention_bf16_256_32", 661, 64, 123, 64, 64 * (2 * 256 + 16), 2, 8},
 };
 
 const Loop& loop_of(const std::string& kernel) {
@@ -127,9 +133,9 @@ class Costs {
   void add_loops(Cost& cost, double n_block, double n_step, const Loop& loop, double rate,
                  double of_instruction) const {
     const double tensor_cycles = of_instruction * 4 * gpu.n_sm * gpu.clock / rate;
-    const double cycles = std::max(loop.tensor * tensor_cycles, loop.instructions / kIssue);
+    const double cycles = loop.n_warp / 4 * std::max(loop.tensor * tensor_cycles, loop.instructions / kIssue);
     add_blocks(cost, n_block, n_step * cycles / gpu.clock);
-    const int registers = (loop.registers + 7) / 8 * 8 * 128;
+    const int registers = (loop.registers + 7) / 8 * 8 * 32 * loop.n_warp;
     const double most = std::min((64 << 10) / registers, gpu.shared / (loop.n_stage * loop.stage));
     const double at_work = std::min(n_block, gpu.n_sm * most);
     const double asked = at_work * (loop.n_stage - 1) * loop.stage;  // bytes that are on their way
@@ -164,12 +170,14 @@ class Costs {
       const double n_block = static_cast<double>((q[2] + 7) / 8 * q[1] * q[3]) * op.n_split;
       return add_blocks(cost, n_block, flop_of(*attention.node) / n_block / (gpu.f32 / gpu.n_sm));
     }
-    const int depth = q[0] <= 64 ? 64 : q[0] <= 80 ? 80 : q[0] <= 128 ? 128 : 256;
-    const Loop& loop = loop_of("attention_bf16_" + std::to_string(depth));
+    const AttentionPlan plan = plan_attention(l, attention);
+    const Loop& loop = loop_of(plan.shape->kernel);
     // Scores and weighted values are two multiply-adds for each query, key and element of a head.
     const double n_key = flop_of(*attention.node) / (4.0 * static_cast<double>(count(q)));
-    const double n_block = static_cast<double>((q[2] + 63) / 64 * q[1] * q[3]) * op.n_split;
-    add_loops(cost, n_block, std::ceil(n_key / loop.step / op.n_split), loop, gpu.bf16, 2 * 16 * 8 * 16);
+    const std::int64_t n_head_kv = l.value(attention.packed[0]).shape[1], n_row = q[1] / n_head_kv * q[2];
+    const std::int64_t n_block = (n_row + plan.shape->rows - 1) / plan.shape->rows * n_head_kv * q[3] * op.n_split;
+    add_loops(cost, static_cast<double>(n_block), std::ceil(n_key / loop.step / op.n_split), loop, gpu.bf16,
+              2 * 16 * 8 * 16);
   }
 
   const CudaLowering& l;

@@ -28,6 +28,8 @@ class CudaLayouts final : Layouts {
       for (const ValueId id : op.reads) ++n_reader_[l.value(id).base];
     for (CudaOp& op : l.ops)
       if (auto* round = std::get_if<RoundOp>(&op.op)) round_at_once(op, *round);
+    for (CudaOp& op : l.ops)
+      if (auto* head = std::get_if<HeadOp>(&op.op)) round_heads_at_once(op, head->rows);
     std::erase_if(l.ops, [](const CudaOp& op) { return op.writes.empty(); });
   }
 
@@ -109,6 +111,31 @@ class CudaLayouts final : Layouts {
     if (!is_attention && !is_other) return;
     maker->writes[0] = round.writes[0];
     round.writes.clear();
+  }
+  /// Rounds heads that are neither normed nor turned as the product that makes them is stored, where nobody else reads
+  /// it.
+  void round_heads_at_once(CudaOp& head, const HeadRows& rows) {
+    const Value x = l.value(rows.x);
+    const ValueId to = head.writes[0];
+    const bool is_whole = is_contiguous(x) && x.offset == 0 && count(x.shape) == count(l.base(rows.x).shape) &&
+                          l.base(rows.x).placement == Value::Placement::arena && !is_tapped(x.base);
+    if (rows.norm != nullptr || rows.rope != nullptr || l.value(to).type != DType::bf16 || !is_whole ||
+        n_reader_[x.base] != 1)
+      return;
+    const auto maker = std::find_if(l.ops.begin(), l.ops.end(), [&](const CudaOp& op) {
+      return !op.writes.empty() && op.writes[0] == x.base && std::holds_alternative<LinearOp>(op.op);
+    });
+    if (maker == l.ops.end()) return;
+    const Shape rows_of_product = l.value(x.base).shape;
+    maker->writes[0] = add_rows(rows_of_product, DType::bf16);
+    l.value(to).base = maker->writes[0];
+    head.writes.clear();
+  }
+  /// Whether a value or a view of it is told.
+  bool is_tapped(ValueId base) const {
+    return std::any_of(l.values.begin(), l.values.end(), [&](const Value& value) {
+      return value.base == base && value.node != nullptr && value.node->tapped;
+    });
   }
   void choose(Step& step, AttentionOp& op) {
     op.rounds = rounds_heads(op.rounds, op.q);

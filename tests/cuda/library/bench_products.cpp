@@ -17,16 +17,17 @@
 #include <utility>
 
 #include "base/bf16.h"
-#include "cuda/driver/gpu.h"
-#include "cuda/driver/modules.h"
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/kernels/linear_int8.h"
+#include "cuda/library/launch_timer.h"
 #include "kernels/quantized.h"
 
 namespace {
 
 using namespace vla;
 using namespace vla::cuda;
+using test::cuda::LaunchTimer;
+using test::cuda::Repeats;
 using Bytes = std::vector<std::byte>;
 
 struct Size {
@@ -39,10 +40,6 @@ constexpr Size kSizes[] = {{50, 720, 32},     {1, 2048, 2048},   {4, 960, 2560},
 constexpr int kSplits[] = {1, 2, 4, 8};
 /// More than the largest cache of a GPU.
 constexpr std::size_t kBeyondCaches = 200u << 20;
-
-struct Repeats {
-  int n_launch, n_time;
-};
 
 std::size_t bytes(std::int64_t n) { return static_cast<std::size_t>(n); }
 
@@ -92,18 +89,13 @@ class Numbers {
 
 class Bench {
  public:
-  static Result<std::unique_ptr<Bench>> open(Repeats repeats) {
-    VLA_TRY(const Driver driver, load_driver());
-    VLA_TRY(std::unique_ptr<Gpu> gpu, Gpu::open(driver, 0, kernel_modules()));
-    VLA_TRY(Stream stream, gpu->stream());
-    return std::unique_ptr<Bench>(new Bench(std::move(gpu), std::move(stream), repeats));
-  }
+  explicit Bench(LaunchTimer timer) : timer_(std::move(timer)) {}
 
   /// Every kind of matrix, shape and split of a size.
   Status run(const Size& size) {
     const std::int64_t rows = size.n_row, columns = size.n_column;
-    VLA_TRY(const Buffer partial, gpu_->allocate(bytes(4 * 8 * rows * columns), "partial sums"));
-    VLA_TRY(const Buffer y, gpu_->allocate(bytes(4 * rows * columns), "y"));
+    VLA_TRY(const Buffer partial, timer_.gpu().allocate(bytes(4 * 8 * rows * columns), "partial sums"));
+    VLA_TRY(const Buffer y, timer_.gpu().allocate(bytes(4 * rows * columns), "y"));
     Epilogue end = {};
     end.y = y.as<void>(), end.y_stride = columns;
     VLA_CHECK(run_bf16(size, partial, end));
@@ -112,13 +104,10 @@ class Bench {
   }
 
  private:
-  Bench(std::unique_ptr<Gpu> gpu, Stream stream, Repeats repeats)
-      : gpu_(std::move(gpu)), stream_(std::move(stream)), repeats_(repeats) {}
-
   Status run_bf16(const Size& size, const Buffer& partial, const Epilogue& end) {
     const std::int64_t stride = round_up(size.depth, 8);
-    VLA_TRY(const Buffer x, upload(numbers_.bf16(size.n_row * stride)));
-    VLA_TRY(const Buffer x_few, upload(numbers_.floats(size.n_row * stride)));
+    VLA_TRY(const Buffer x, timer_.upload(numbers_.bf16(size.n_row * stride)));
+    VLA_TRY(const Buffer x_few, timer_.upload(numbers_.floats(size.n_row * stride)));
     VLA_TRY(const auto matrices, fill_matrices(bytes(2 * size.n_column * stride), numbers_.bf16(kPattern / 2)));
     for (const int n_split : kSplits)
       for (const auto& [name, shape] :
@@ -138,8 +127,8 @@ class Bench {
   Status run_codes(const char* kind, CodeKind code, const Bytes& pattern, const Size& size, const Buffer& partial,
                    const Epilogue& end) {
     const std::int64_t stride = kernels::quantized_stride(size.depth);
-    VLA_TRY(const Buffer x, upload(numbers_.quantized(size.n_row, size.depth)));
-    VLA_TRY(const Buffer scale, upload(numbers_.floats(size.n_column)));
+    VLA_TRY(const Buffer x, timer_.upload(numbers_.quantized(size.n_row, size.depth)));
+    VLA_TRY(const Buffer scale, timer_.upload(numbers_.floats(size.n_column)));
     VLA_TRY(const auto matrices, fill_matrices(packed_int8_size(code, size.depth, size.n_column), pattern));
     for (const int n_split : kSplits)
       for (const auto& [name, shape] :
@@ -157,54 +146,25 @@ class Bench {
     return {};
   }
 
-  Result<Buffer> upload(const Bytes& values) {
-    VLA_TRY(Buffer buffer, gpu_->allocate(values.size(), "operands"));
-    VLA_CHECK(stream_.upload(buffer.address(), values.data(), values.size()));
-    VLA_CHECK(stream_.wait());
-    return buffer;
-  }
   /// As many matrices as no cache holds together, but no more than there are launches, of the pattern again and again.
   Result<std::vector<Buffer>> fill_matrices(std::size_t size, const Bytes& pattern) {
-    const std::size_t n = std::clamp<std::size_t>(kBeyondCaches / size + 1, 1, bytes(repeats_.n_launch));
+    const std::size_t n = std::clamp<std::size_t>(kBeyondCaches / size + 1, 1, bytes(timer_.repeats().n_launch));
     std::vector<Buffer> matrices;
     while (matrices.size() < n) {
-      VLA_TRY(Buffer matrix, gpu_->allocate(size, "matrices"));
+      VLA_TRY(Buffer matrix, timer_.gpu().allocate(size, "matrices"));
       for (std::size_t at = 0; at < size; at += pattern.size())
-        VLA_CHECK(stream_.upload(matrix.address() + at, pattern.data(), std::min(pattern.size(), size - at)));
+        VLA_CHECK(timer_.stream().upload(matrix.address() + at, pattern.data(), std::min(pattern.size(), size - at)));
       matrices.push_back(std::move(matrix));
     }
-    VLA_CHECK(stream_.wait());
+    VLA_CHECK(timer_.stream().wait());
     return matrices;
-  }
-
-  /// Microseconds of one launch of a graph of so many, whose jobs take turns: the median of several graphs' launches.
-  template <class Job>
-  Result<float> time_launches(std::span<const Job> jobs, const std::vector<Launch>& launches) {
-    VLA_TRY(const Owned first, gpu_->event(true));
-    VLA_TRY(const Owned last, gpu_->event(true));
-    for (const Launch& launch : launches) VLA_CHECK(gpu_->prepare(launch));
-    VLA_CHECK(stream_.begin_capture());
-    VLA_CHECK(stream_.note_time(first));
-    for (int i = 0; i < repeats_.n_launch; ++i)
-      for (const Launch& launch : launches) VLA_CHECK(stream_.launch(launch, jobs[bytes(i) % jobs.size()]));
-    VLA_CHECK(stream_.note_time(last));
-    VLA_TRY(const Owned graph, stream_.end_capture());
-    std::vector<float> times;
-    for (int i = 0; i <= repeats_.n_time; ++i) {
-      VLA_CHECK(stream_.launch(graph));
-      VLA_CHECK(stream_.wait());
-      VLA_TRY(const float ms, gpu_->elapsed(first, last));
-      if (i > 0) times.push_back(1e3f * ms / static_cast<float>(repeats_.n_launch));  // the first one warms it up
-    }
-    std::sort(times.begin(), times.end());
-    return times[times.size() / 2];
   }
 
   template <class Job>
   Status tell(const char* kind, const Size& size, const char* shape, int n_split, const std::vector<Job>& jobs,
               const std::vector<Launch>& launches) {
-    VLA_TRY(const float us, time_launches(std::span<const Job>(jobs), launches));
-    VLA_TRY(const float warm, time_launches(std::span<const Job>(jobs).first(1), launches));
+    VLA_TRY(const float us, timer_.time(std::span<const Job>(jobs), launches));
+    VLA_TRY(const float warm, timer_.time(std::span<const Job>(jobs).first(1), launches));
     const double flop = 2.0 * size.n_row * size.depth * size.n_column;
     fmt::print(
         R"({{"kind": "{}", "rows": {}, "depth": {}, "columns": {}, "shape": "{}", "splits": {}, "us": {:.2f}, "warm_us": {:.2f}, "tera": {:.3f}}})"
@@ -214,15 +174,14 @@ class Bench {
   }
 
   static constexpr std::int64_t kPattern = 4 << 20;  // bytes
-  std::unique_ptr<Gpu> gpu_;
-  Stream stream_;
-  Repeats repeats_;
+  LaunchTimer timer_;
   Numbers numbers_;
 };
 
 Status run(int n_size, Repeats repeats) {
-  VLA_TRY(const std::unique_ptr<Bench> bench, Bench::open(repeats));
-  for (int i = 0; i < n_size; ++i) VLA_CHECK(bench->run(kSizes[i]));
+  VLA_TRY(LaunchTimer timer, LaunchTimer::open(repeats));
+  Bench bench(std::move(timer));
+  for (int i = 0; i < n_size; ++i) VLA_CHECK(bench.run(kSizes[i]));
   return {};
 }
 
