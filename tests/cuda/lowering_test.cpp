@@ -108,3 +108,18 @@ TEST_CASE("products of bf16 give a chunk nearer to the float32 reference than Py
     }
   }
 }
+
+TEST_CASE("attention of few queries fills a device, and of many takes the keys one tile after the other") {
+  const auto blocks = [](std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm) {
+    const lower::AttentionPlan plan = lower::plan_attention(d_head, n_row, n_unit, n_key, n_sm);
+    CHECK(plan.shape->depth >= d_head);
+    CHECK(plan.n_split <= vla::cuda::kMaxAttentionSplit);
+    return (n_row + plan.shape->rows - 1) / plan.shape->rows * n_unit * plan.n_split;
+  };
+  CHECK(blocks(256, 400, 1, 610, 132) >= 100);  // a step of an action expert with one head of keys
+  CHECK(blocks(256, 400, 1, 610, 132) <= 132);
+  CHECK(lower::plan_attention(64, 150, 5, 227, 132).n_split == 1);  // keys of one tile
+  CHECK(lower::plan_attention(64, 1024, 24, 1024, 132).shape->key_groups == 1);
+  CHECK(lower::plan_attention(64, 1024, 24, 1024, 132).n_split == 1);
+  CHECK(blocks(72, 16, 1, 1 << 16, 132) >= 8);
+}

@@ -41,6 +41,15 @@ def test_convolutions_of_int8_have_the_cpus_codes(vla, tmp_path):
     assert np.abs(gpu - cpu).max() < 1e-5 < 1e-3 < np.abs(cpu - tensors(case.expected)["chunk"]).max()
 
 
+def test_heads_that_nothing_turns_are_rounded_as_their_product_is_stored(vla):
+    graph = vla("inspect", Golden("xvla/two_views").bundle, *DEVICE, "--kernels", "bf16", "--graph", "step").out
+    lines = [line for line in graph.splitlines() if "transformer.blk.0.attn_" in line]
+    made = {line.split("transformer.blk.0.attn_")[1][0]: line.split(" -> ")[1] for line in lines if "linear" in line}
+    assert all(made[one].startswith("bf16[") for one in "qkv"), lines
+    assert "attention_bf16" in next(line for line in lines if "attn_heads" in line)
+    assert "heads  f32" not in graph
+
+
 def test_kernels_that_a_build_lacks_are_refused_by_the_library_that_has_them(vla, golden):
     answer = vla(*golden.arguments(options=[*DEVICE, "--kernels", "ggml"]))
     answer.refused("device", "cuda:0: expected one of cpu", "no libvla-cuda-ggml.so in ")
