@@ -56,12 +56,12 @@ void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 enum class ProductShape { few, rows64, rows128 };
 ProductShape product_shape(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, int n_sm);
 
-/// How blocks on tensor cores cut rows of queries and shares of keys.
+/// How blocks cut rows of queries and shares of keys.
 struct AttentionPlan {
-  const cuda::AttentionShape* shape;
+  const cuda::AttentionShape* shape;  // on tensor cores, else null
   int n_split;
 };
-/// The fastest by estimates. n_row: of each of n_unit heads of keys in a batch.
+/// The fastest on tensor cores, by estimates. n_row: of each of n_unit heads of keys in a batch.
 AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key,
                              int n_sm);
 AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op);

@@ -1,0 +1,64 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <numeric>
+
+#include "lower/cuda/cuda_lowering.h"
+
+namespace vla::lower {
+namespace {
+
+std::int64_t count_keys(const AttentionOp& op) {
+  return std::accumulate(op.n_key.begin(), op.n_key.end(), std::int64_t{0});
+}
+
+/// Microseconds of a block's begin with its first loads, and of the kernel that combines shares.
+constexpr double kBegin = 1.5, kFinish = 2;
+/// What part of a block's time each further one on the same SM adds.
+constexpr double kFurther = 0.6;
+/// Bytes of partial sums that an SM's part of the cache moves in a microsecond.
+constexpr double kPartial = 40e3;
+
+double microseconds(const cuda::AttentionShape& shape, std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit,
+                    std::int64_t n_key, std::int64_t n_split, int n_sm) {
+  const bool shares = shape.key_groups > 1;
+  const std::int64_t n_block = (n_row + shape.rows - 1) / shape.rows * n_unit * n_split;
+  const std::int64_t share = (n_key + n_split - 1) / n_split, n_tile = (share + shape.keys - 1) / shape.keys;
+  const double of_tile = shares ? 0.5 : 0.2, products = shape.rows * shape.keys * shape.depth;
+  const double block = static_cast<double>(n_tile) * (of_tile + products / (shares ? 450e3 : 650e3));
+  const double each = 1 + kFurther * static_cast<double>((n_block + n_sm - 1) / n_sm - 1);
+  const double finish =
+      n_split == 1 ? 0
+                   : kFinish + 8.0 * static_cast<double>((d_head + 2) * n_row * n_unit * n_split) / (kPartial * n_sm);
+  return kBegin + each * block + finish;
+}
+
+}  // namespace
+
+AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key,
+                             int n_sm) {
+  AttentionPlan best = {nullptr, 1};
+  double least = 0;
+  for (const cuda::AttentionShape& shape : cuda::kAttentionShapes) {
+    if (shape.depth < d_head || (best.shape != nullptr && shape.depth > best.shape->depth)) continue;
+    const std::int64_t most = std::min<std::int64_t>((n_key + 63) / 64, cuda::kMaxAttentionSplit);
+    for (std::int64_t n_split = 1; n_split <= std::max<std::int64_t>(most, 1); ++n_split) {
+      const double time = microseconds(shape, d_head, n_row, n_unit, n_key, n_split, n_sm);
+      if (best.shape == nullptr || time < least) best = {&shape, static_cast<int>(n_split)}, least = time;
+    }
+  }
+  return best;
+}
+AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op) {
+  const Shape& q = l.value(op.q.x).shape;
+  const std::int64_t n_key = count_keys(op);
+  if (op.rounds) {
+    const std::int64_t n_head_kv = l.value(op.packed[0]).shape[1];
+    return plan_attention(q[0], q[1] / n_head_kv * q[2], n_head_kv * q[3], n_key, l.n_sm);
+  }
+  const std::int64_t n_block = q[1] * q[3] * ((q[2] + 7) / 8);  // at least so many
+  const std::int64_t most = std::min<std::int64_t>((n_key + 127) / 128, cuda::kMaxAttentionSplit);
+  return {nullptr, static_cast<int>(std::clamp<std::int64_t>(l.n_sm / n_block, 1, most))};
+}
+
+}  // namespace vla::lower
