@@ -68,25 +68,37 @@ def run(command):
     return process.stdout + process.stderr
 
 
-def compile_ptx(source, out, sources=SOURCES, warnings=("-Werror", "all-warnings")):
-    """PTX for any GPU from Ampere on, and for drivers from CUDA 12.6 on (JetPack 6), whose PTX is version 8.5."""
-    target = Path(out) / f"{source.stem}.ptx"
-    run(
-        [tool("nvcc"), "-std=c++20", "-O3", *warnings, "-arch=compute_80", f"-I{sources}", "-ptx", source, "-o", target]
-    )
-    target.write_text(re.sub(r"^\.version .*", ".version 8.5", target.read_text(), flags=re.M))
-    return target
+def targets(source):
+    """What a source is compiled for: from Ampere on, from Hopper on, or Hopper alone, whose own units no other GPU has."""
+    return ("90a",) if source.stem.startswith("hopper_") else ("80", "90")
+
+
+def fits(ptx, sm):
+    """Whether a GPU of an architecture runs a file, as Gpu::open chooses."""
+    target = re.search(r"_sm(\d+a?)$", ptx.stem)[1]
+    return {"80": sm < 90, "90": sm >= 90, "90a": sm == 90}[target]
+
+
+def compile_ptx(source, out, target, sources=SOURCES, warnings=("-Werror", "all-warnings")):
+    """PTX for drivers from CUDA 12.6 on (JetPack 6), whose PTX is version 8.5."""
+    target_file = Path(out) / f"{source.stem}_sm{target}.ptx"
+    arch = f"-arch=compute_{target}"
+    run([tool("nvcc"), "-std=c++20", "-O3", *warnings, arch, f"-I{sources}", "-ptx", source, "-o", target_file])
+    target_file.write_text(re.sub(r"^\.version .*", ".version 8.5", target_file.read_text(), flags=re.M))
+    return target_file
 
 
 def compile_all(out):
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(lambda source: compile_ptx(source, out), kernel_files()))
+        jobs = [(source, out, target) for source in kernel_files() for target in targets(source)]
+        return list(pool.map(lambda job: compile_ptx(*job), jobs))
 
 
 def assemble(ptx, sm, out):
     """(machine code, {kernel: {registers, spills in bytes, static shared memory}})."""
     cubin = Path(out) / f"{ptx.stem}.sm_{sm}.cubin"
-    told = run([tool("ptxas"), "-v", f"-arch=sm_{sm}", ptx, "-o", cubin])
+    arch = f"-arch=sm_{sm}{'a' if ptx.stem.endswith('a') else ''}"
+    told = run([tool("ptxas"), "-v", arch, ptx, "-o", cubin])
     kernels = {}
     for part in told.split("Compiling entry function")[1:]:
         name = re.match(r" '(\S+)'", part)[1]
@@ -144,8 +156,8 @@ def shares(counts, sm):
 
 
 def report(ptx_files, sm, out):
-    """Yields (kernel, resources, counts of its main loop)."""
-    for ptx in ptx_files:
+    """Yields (kernel, resources, counts of its main loop) of the files that the architecture runs."""
+    for ptx in [one for one in ptx_files if fits(one, sm)]:
         cubin, kernels = assemble(ptx, sm, out)
         code = instructions(cubin) if tool("nvdisasm") else {}
         for name in sorted(kernels):

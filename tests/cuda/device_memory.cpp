@@ -5,6 +5,7 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cstring>
 #include <new>
 
@@ -56,6 +57,13 @@ DeviceMemory::Allocation* DeviceMemory::check(std::uintptr_t p, std::size_t size
   }
   if (size >= 4) check_race(*hint, p, size, writes);
   return hint;
+}
+
+bool DeviceMemory::has_result(const Allocation& in, std::uintptr_t p, std::size_t size) {
+  const std::size_t first = (p - in.first) / 4, end = (p - in.first + size + 3) / 4;
+  return std::any_of(in.writer.begin() + static_cast<std::ptrdiff_t>(first),
+                     in.writer.begin() + static_cast<std::ptrdiff_t>(end),
+                     [](std::uint32_t block) { return block != 0; });
 }
 
 void DeviceMemory::check_race(Allocation& in, std::uintptr_t p, std::size_t size, bool writes) {

@@ -34,6 +34,8 @@ class DeviceMemory {
 
   void begin_launch() { launch_ = block_ + 1; }
   void begin_block() { ++block_; }
+  /// Whether a kernel has written any word of [p, p + size).
+  static bool has_result(const Allocation& in, std::uintptr_t p, std::size_t size);
   /// Checks an access and tells in which allocation it is; `hint` may be where the last one was, or null.
   Allocation* check(std::uintptr_t p, std::size_t size, bool writes, Allocation* hint);
 

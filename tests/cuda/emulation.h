@@ -15,6 +15,7 @@
 
 #define __shared__
 #define VLA_DEVICE inline
+#define VLA_EARLY_KERNEL VLA_KERNEL
 #define VLA_KERNEL(name, threads, blocks, Job)                                                             \
   static void name##_kernel(const Job& job);                                                               \
   static const ::vla::test::cuda::Entry name##_entry(                                                      \
@@ -96,6 +97,7 @@ inline void __syncwarp() {
 namespace vla::cuda::dev {
 
 using test::cuda::commit_copies, test::cuda::shared_memory;
+inline void wait_for_earlier() {}
 template <class T>
 T read(const std::byte* p) {
   test::cuda::check_shared(p, sizeof(T), false);

@@ -344,13 +344,13 @@ struct Calls {
     function->max_shared = static_cast<unsigned>(value);
     return 0;
   }
-  static int launch(Handle handle, unsigned x, unsigned y, unsigned z, unsigned n_thread, unsigned block_y,
-                    unsigned block_z, unsigned shared, Handle stream, void** parameters, void** extra) {
+  static int launch(const vla::cuda::LaunchConfig* config, Handle handle, void** parameters, void** extra) {
+    const auto [x, y, z, n_thread, block_y, block_z, shared, stream, attributes, n_attribute] = *config;
     const Function* function = find(state.functions, handle);
     if (function == nullptr) return kInvalidHandle;
     const unsigned most = vla::cuda::kMaxGridYZ;
     if (shared > function->max_shared || block_y != 1 || block_z != 1 || extra != nullptr || x == 0 || y == 0 ||
-        z == 0 || y > most || z > most)
+        z == 0 || y > most || z > most || !is_known(attributes, n_attribute))
       return kInvalidValue;
     const std::size_t size = function->ptx ? function->ptx->param_size : function->entry->job_size;
     if (!state.driver.computes) return enqueue(stream, [] {});
@@ -407,6 +407,11 @@ struct Calls {
   static int executable_destroy(Handle executable) { return take_back(state.graphs, executable); }
 
  private:
+  /// Whether attributes of a launch are none, or that it may begin while the kernel before it ends, which one from
+  /// Hopper on may. Kernels of the machine run one after the other all the same.
+  static bool is_known(const vla::cuda::LaunchAttribute* attributes, unsigned n) {
+    return n == 0 || (n == 1 && attributes[0].id == 6 && state.driver.major >= 9);
+  }
   /// What the compiler says, where the options ask for it: 5 the room for its errors, 6 how many bytes that has.
   static void write_log(const char* text, unsigned n_option, const int* options, void* const* values) {
     char* room = nullptr;

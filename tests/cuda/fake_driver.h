@@ -23,7 +23,7 @@ constexpr int kInvalidValue = 1, kOutOfMemory = 2, kInvalidContext = 201, kInval
 
 /// How the driver behaves, and what was asked of it.
 struct FakeDriver {
-  int version = 13000, n_device = 1, major = 8, minor = 7, n_sm = 16;
+  int version = 13000, n_device = 1, major = 9, minor = 0, n_sm = 16;
   std::size_t memory = std::size_t{1} << 30;
   /// The number of the call that fails, counted from 1 since reset, and with what; 0: none. A lost device answers every
   /// later call so too.

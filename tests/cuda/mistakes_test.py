@@ -342,8 +342,9 @@ def outcome(name, ptx, folder):
     text = place.read_text()
     assert text.count(old) >= 1, f"{name}: {file} has no {old!r}"
     place.write_text(text.replace(old, new))
-    module = cuda_kernels.compile_ptx(sources / f"cuda/kernels/{kernel}.cu", folder, sources, warnings=())
-    others = [one for one in ptx if one.stem != kernel]
+    source = sources / f"cuda/kernels/{kernel}.cu"
+    module = cuda_kernels.compile_ptx(source, folder, cuda_kernels.targets(source)[-1], sources, warnings=())
+    others = [one for one in ptx if one.name != module.name]
     code, output = run_tests([module, *others], f"--source-file={TESTS[kernel]}", "--abort-after=1")
     shutil.rmtree(folder)
     return output if code else ""

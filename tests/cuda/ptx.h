@@ -43,6 +43,7 @@ struct PtxKernel {
   std::vector<PtxInstruction> code;
   std::size_t register_bytes = 0, param_size = 0, static_shared = 0;
   int max_thread = 1024;
+  bool overlaps = false;             // begins while earlier kernels end, and waits for them
   std::vector<std::byte> constants;  // how the registers begin: constants stand first
   struct Special {
     std::uint32_t place;

@@ -224,6 +224,7 @@ class Reader {
     if (operation == nullptr) throw Fault("unknown instruction " + name);
     one.run = operation->run, one.kind = operation->kind;
     const std::string_view types = operation->operands;
+    kernel_.overlaps |= name == "griddepcontrol.wait";
     if (operands.size() != types.size()) throw Fault("another number of operands than " + std::string(types));
     int n_address = 0;
     for (std::size_t i = 0; i < types.size(); ++i) {

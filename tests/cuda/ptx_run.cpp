@@ -26,6 +26,7 @@ struct WarpState {
   u32 active = 0;        // lanes that do the instruction
   u32 live = kAll;       // lanes that have not returned
   u32 waits = 0;         // lanes at an instruction that all lanes do together
+  u32 early = 0;         // lanes that have not waited for earlier kernels yet
   bool together = true;  // all lanes that live are at pc
   int pc = 0, pcs[kWarp] = {};
   int number = 0;
@@ -108,6 +109,8 @@ DeviceMemory::Allocation* fresh_hint(const PtxInstruction& i) {
 std::byte* global(WarpState& w, const PtxInstruction& i, int which, int lane, std::size_t size, bool writes) {
   const u64 p = w.lanes<u64>(i.operand[which])[lane] + static_cast<u64>(i.offset[which]);
   guarded(w, i, lane, [&] { i.hint = device_memory().check(p, size, writes, fresh_hint(i)); });
+  if (w.early >> lane & 1 && (writes || device_memory().has_result(*i.hint, p, size)))
+    fault_at(w, i, lane, "does not wait for earlier kernels");
   return reinterpret_cast<std::byte*>(p);
 }
 std::size_t in_shared(WarpState& w, const PtxInstruction& i, int lane) {
@@ -183,6 +186,8 @@ void copy_async(WarpState& w, const PtxInstruction& i) {
       if (at % 16 != 0) fault_at(w, i, l, "source of an asynchronous copy is not aligned");
       for (u32 b = 0, step = sizes[l] == 16 ? 16 : 1; b < sizes[l]; b += step)
         guarded(w, i, l, [&] { i.hint = device_memory().check(at + b, step, false, fresh_hint(i)); });
+      if (w.early >> l & 1 && device_memory().has_result(*i.hint, at, sizes[l]))
+        fault_at(w, i, l, "does not wait for earlier kernels");
     }
     guarded(w, i, l, [&] { w.shared->copy(in_shared(w, i, l), from, sizes[l], w.thread(l)); });
   });
@@ -381,6 +386,8 @@ const PtxOperation kOperations[] = {
      [](WarpState& w,
         const PtxInstruction&
             i) { each_lane(w.active, [&](int l) { w.shared->wait(w.lanes<u32>(i.operand[0])[l], w.thread(l)); }); }},
+    {"griddepcontrol.launch_dependents", "", [](WarpState&, const PtxInstruction&) {}},
+    {"griddepcontrol.wait", "", [](WarpState& w, const PtxInstruction&) { w.early &= ~w.active; }},
     {"bar.sync", "d", nullptr, PtxInstruction::kBarrier},
     {"bar.warp.sync", "d", warp_barrier, PtxInstruction::kWarp},
     {"shfl.sync.bfly.b32", "dpdddd", shuffle<true>, PtxInstruction::kWarp},
@@ -458,6 +465,7 @@ bool run_warp(WarpState& w, const PtxKernel& kernel) {
         jumps = active;
         break;
       case PtxInstruction::kReturn:
+        if (w.early & active) throw Fault("ends without having waited for earlier kernels");
         w.live &= ~active;
         break;
       case PtxInstruction::kBarrier:
@@ -499,7 +507,7 @@ void run_block(const PtxKernel& kernel, Extent grid, BlockIndex at, unsigned n_t
   device_memory().begin_block();
   for (std::size_t i = 0; i < warps.size(); ++i) {
     WarpState& w = warps[i];
-    w.live = kAll, w.waits = 0, w.together = true, w.pc = 0, w.n_done = 0;
+    w.live = kAll, w.waits = 0, w.early = kernel.overlaps ? kAll : 0, w.together = true, w.pc = 0, w.n_done = 0;
     w.number = static_cast<int>(i), w.job = static_cast<const std::byte*>(job), w.job_size = kernel.param_size;
     w.shared = &shared;
     w.registers.resize(kernel.register_bytes);

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cstdlib>
 
 #include "base/printable.h"
 
@@ -15,10 +16,22 @@ constexpr int kOutOfMemory = 2, kNotFound = 500;
 constexpr int kCapabilityMajor = 75, kCapabilityMinor = 76, kCountSm = 16, kMaxDynamicShared = 8;
 constexpr unsigned kNonBlocking = 1, kNoTiming = 2, kFreeShared = 48 << 10;
 constexpr int kThreadLocal = 1;
+constexpr int kOverlaps = 6;                     // attribute of a launch: programmatic stream serialization
 constexpr int kErrorLog = 5, kErrorLogSize = 6;  // options of module_load
 
 std::string version_text(int version) {
   return std::to_string(version / 1000) + "." + std::to_string(version % 1000 / 10);
+}
+
+/// Whether a module is for a device of this capability. One that names no architecture is for all.
+bool is_for(const std::string& module, int capability) {
+  const std::size_t at = module.find(".target sm_");
+  if (at == std::string::npos) return true;
+  const char* text = module.c_str() + at + 11;
+  char* end = nullptr;
+  const long target = std::strtol(text, &end, 10);
+  if (*end == 'a') return capability == target;
+  return target == (capability < 90 ? 80 : 90);
 }
 
 }  // namespace
@@ -90,7 +103,8 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
   VLA_CHECK(CALL(device_attribute, &major, kCapabilityMajor, device_));
   VLA_CHECK(CALL(device_attribute, &minor, kCapabilityMinor, device_));
   VLA_CHECK(CALL(device_attribute, &n_sm_, kCountSm, device_));
-  if (major * 10 + minor < kMinCapability)
+  capability_ = major * 10 + minor;
+  if (capability_ < kMinCapability)
     return Error{Code::device, "cuda:" + std::to_string(device), "compute capability 8.0 or newer (Ampere)",
                  std::to_string(major) + "." + std::to_string(minor)};
   char name[256] = {};
@@ -99,6 +113,7 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
   VLA_CHECK(CALL(context_retain, &context_, device_));
   VLA_CHECK(use());
   for (const std::string& text : modules) {
+    if (!is_for(text, capability_)) continue;
     VLA_TRY(Owned loaded, load(text));
     modules_.push_back(std::move(loaded));
   }
@@ -215,15 +230,21 @@ Result<Handle> Gpu::kernel(const Launch& how) {
 #define CALL(name, ...) gpu_->check(#name, gpu_->driver_.name(__VA_ARGS__))
 
 Status Stream::fill(Address to, unsigned char value, std::size_t size) {
+  follows_kernel_ = false;
   return CALL(fill, to, value, size, stream_.get());
 }
 Status Stream::upload(Address to, const void* from, std::size_t size) {
+  follows_kernel_ = false;
   return CALL(upload, to, from, size, stream_.get());
 }
 Status Stream::download(void* to, Address from, std::size_t size) {
+  follows_kernel_ = false;
   return CALL(download, to, from, size, stream_.get());
 }
-Status Stream::copy(Address to, Address from, std::size_t size) { return CALL(copy, to, from, size, stream_.get()); }
+Status Stream::copy(Address to, Address from, std::size_t size) {
+  follows_kernel_ = false;
+  return CALL(copy, to, from, size, stream_.get());
+}
 Status Stream::wait() { return CALL(stream_wait, stream_.get()); }
 
 Status Stream::after(Stream& other) {
@@ -231,9 +252,13 @@ Status Stream::after(Stream& other) {
   return after(other.event_);
 }
 Status Stream::record(const Owned& event) { return CALL(event_record, event.get(), stream_.get()); }
-Status Stream::after(const Owned& event) { return CALL(stream_wait_event, stream_.get(), event.get(), 0); }
+Status Stream::after(const Owned& event) {
+  follows_kernel_ = false;
+  return CALL(stream_wait_event, stream_.get(), event.get(), 0);
+}
 
 Status Stream::note_time(const Owned& event) {
+  follows_kernel_ = false;
   constexpr unsigned kExternal = 1;  // a node of the graph, instead of a point that other streams wait for
   return CALL(event_record_flags, event.get(), stream_.get(), kExternal);
 }
@@ -241,13 +266,21 @@ Status Stream::note_time(const Owned& event) {
 Status Stream::launch_job(const Launch& how, const void* job) {
   VLA_TRY(Handle function, gpu_->kernel(how));
   void* parameters[] = {const_cast<void*>(job)};  // the driver copies what it points at
-  return CALL(launch, function, how.grid.x, how.grid.y, how.grid.z, how.n_thread, 1, 1, how.shared, stream_.get(),
-              parameters, nullptr);
+  LaunchAttribute overlaps = {kOverlaps, 0, {1}};
+  const bool may_overlap = follows_kernel_ && gpu_->capability_ >= 90;
+  const LaunchConfig config = {how.grid.x, how.grid.y, how.grid.z,    how.n_thread, 1,
+                               1,          how.shared, stream_.get(), &overlaps,    may_overlap ? 1U : 0U};
+  follows_kernel_ = true;
+  return CALL(launch, &config, function, parameters, nullptr);
 }
 
-Status Stream::begin_capture() { return CALL(capture_begin, stream_.get(), kThreadLocal); }
+Status Stream::begin_capture() {
+  follows_kernel_ = false;
+  return CALL(capture_begin, stream_.get(), kThreadLocal);
+}
 
 Result<Owned> Stream::end_capture() {
+  follows_kernel_ = false;
   Handle graph = nullptr, executable = nullptr;
   const int ended = gpu_->driver_.capture_end(stream_.get(), &graph);
   VLA_TRY(const Owned recorded, gpu_->own("capture_end", ended, graph, gpu_->driver_.graph_destroy));
@@ -255,7 +288,10 @@ Result<Owned> Stream::end_capture() {
   return gpu_->own("graph_instantiate", made, executable, gpu_->driver_.executable_destroy);
 }
 
-Status Stream::launch(const Owned& graph) { return CALL(graph_launch, graph.get(), stream_.get()); }
+Status Stream::launch(const Owned& graph) {
+  follows_kernel_ = false;
+  return CALL(graph_launch, graph.get(), stream_.get());
+}
 
 #undef CALL
 

@@ -65,7 +65,8 @@ class Stream {
   Status launch(const Launch& how, const Job& job) {
     return launch_job(how, &job);
   }
-  /// Launches a kernel; `job` points to its parameter.
+  /// Launches a kernel; `job` points to its parameter. From Hopper on it may begin while the kernel just before it in
+  /// the stream ends, and itself waits for that one's results (device.h, wait_for_earlier).
   Status launch_job(const Launch& how, const void* job);
   /// Waits until all operations are done.
   Status wait();
@@ -91,6 +92,7 @@ class Stream {
 
   Gpu* gpu_;
   Owned stream_, event_;
+  bool follows_kernel_ = false;  // whether the latest operation is a kernel
 };
 
 /// A GPU that may be opened.
@@ -107,7 +109,8 @@ class Gpu {
   /// Driver version and compute capability that our kernels need.
   static constexpr int kMinDriver = 12060, kMinCapability = 80;
 
-  /// Opens the device's context and loads the modules from PTX texts.
+  /// Opens the device's context and loads those of the modules, PTX texts, that are of its architecture: of texts for
+  /// sm_80 and for sm_90 the latter from Hopper on; one for sm_90a on Hopper alone.
   static Result<std::unique_ptr<Gpu>> open(const Driver& driver, int device, const std::vector<std::string>& modules);
   Gpu(const Gpu&) = delete;
   ~Gpu();
@@ -119,6 +122,8 @@ class Gpu {
   /// How many blocks of large kernels run at a time, approximately.
   int n_sm() const { return n_sm_; }
   const std::string& name() const { return name_; }
+  /// Of compute capability 9.0, with units that no other GPU has.
+  bool is_hopper() const { return capability_ == 90; }
   /// Has the driver load a kernel and allow it its shared memory, as the first launch does. Before a capture: a driver
   /// may have to wait or to allocate for it, which no stream that captures allows.
   Status prepare(const Launch& how);
@@ -146,7 +151,7 @@ class Gpu {
   Result<Owned> own(const char* call, int result, Handle handle, Owned::Release release) const;
 
   Driver driver_;
-  int device_ = -1, n_sm_ = 1;
+  int device_ = -1, n_sm_ = 1, capability_ = 0;
   std::string name_;
   Handle context_ = nullptr;
   std::vector<Owned> modules_;
