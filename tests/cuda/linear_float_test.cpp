@@ -28,6 +28,8 @@ constexpr Case kCases[] = {
     {129, 72, 130, 1, Activation::silu, true, true, true, true, true},
     {67, 301, 70, 3, Activation::gelu_erf, true, false, false, true},
     {16, 1000, 35, 4, Activation::relu_squared, false, true},
+    {50, 720, 70, 1, Activation::none, false, false, false, true, true},
+    {48, 296, 20, 3, Activation::silu, true, false, true},
     {65, 48, 66, 1, Activation::none, true, false, false, true, false, true},
 };
 
@@ -91,7 +93,9 @@ TEST_CASE(
     "rounded") {
   counts = {};
   for (const Case& c : kCases) {
-    for (Bf16Shape shape : {Bf16Shape::few, Bf16Shape::rows64, Bf16Shape::rows128}) {
+    for (Bf16Shape shape : {Bf16Shape::few, Bf16Shape::strip16, Bf16Shape::strip32, Bf16Shape::strip64,
+                            Bf16Shape::rows64, Bf16Shape::rows128}) {
+      if (is_strip(shape) && c.depth % 8 != 0) continue;
       INFO("shape ", static_cast<int>(shape), ", ", c.n_row, " x ", c.depth, " x ", c.n_column);
       const bool is_few = shape == Bf16Shape::few;
       const Operands of(c, !is_few);

@@ -122,7 +122,7 @@ class Reader {
   }
 
   std::uint32_t constant(std::uint64_t value, char type) {
-    if (type == 'p') throw Fault("a constant predicate");
+    if (type == 'p') return constant(value == 0 ? 0 : 0xffffffff, 'd');  // the mask of all lanes
     const std::size_t width = type == 'q' ? 8 : 4;
     for (std::size_t i = 0; i < constants_.size(); ++i)
       if (constants_[i].value == value && constants_[i].width == width)

@@ -19,23 +19,45 @@ VLA_DEVICE float activate(Activation activation, float x) {
   return x / (1 + expf(-u));
 }
 
-/// y of one sum. Products and sums are not fused, so y without an activation equals the CPU's to the bit.
-VLA_DEVICE float finish(const Epilogue& e, float sum, std::int64_t row, int column, int n_column) {
+/// What an epilogue reads for two adjacent columns of a row, so that it can be asked for before the sums are there.
+struct PairEnds {
+  float2 bias = {0, 0}, factor = {1, 1}, gate = {0, 0}, residual = {0, 0};
+  bool has_second;
+};
+VLA_DEVICE PairEnds load_ends(const Epilogue& e, std::int64_t row, int column, int n_column) {
+  PairEnds ends;
+  ends.has_second = column + 1 < n_column;
+  const auto load = [&](const float* from, std::int64_t at, float2& to) {
+    if (from == nullptr) return;
+    if (at % 2 == 0 && ends.has_second && reinterpret_cast<std::uint64_t>(from) % 8 == 0) {
+      to = *reinterpret_cast<const float2*>(from + at);
+    } else {
+      to.x = from[at];
+      if (ends.has_second) to.y = from[at + 1];
+    }
+  };
   const std::int64_t at = row * n_column + column;
-  if (e.bias) sum = dev::add(sum, e.bias[column]);
-  sum = e.gate ? dev::multiply(activate(e.activation, e.gate[at]), sum) : activate(e.activation, sum);
-  if (e.factor) sum = dev::multiply(sum, e.factor[column]);
-  if (e.residual) sum = dev::add(sum, e.residual[at]);
+  load(e.bias, column, ends.bias), load(e.factor, column, ends.factor);
+  load(e.gate, at, ends.gate), load(e.residual, at, ends.residual);
+  return ends;
+}
+
+/// y of one sum. Products and sums are not fused, so y without an activation equals the CPU's to the bit.
+VLA_DEVICE float finish(const Epilogue& e, float sum, float bias, float factor, float gate, float residual) {
+  if (e.bias) sum = dev::add(sum, bias);
+  sum = e.gate ? dev::multiply(activate(e.activation, gate), sum) : activate(e.activation, sum);
+  if (e.factor) sum = dev::multiply(sum, factor);
+  if (e.residual) sum = dev::add(sum, residual);
   return e.ends_in_relu ? activate(Activation::relu, sum) : sum;
 }
 
 /// Stores y of two adjacent sums; the second may be after the last column.
-VLA_DEVICE void finish_pair(const Epilogue& e, float first, float second, std::int64_t row, int column, int n_column) {
-  const bool has_second = column + 1 < n_column;
-  first = finish(e, first, row, column, n_column);
-  second = has_second ? finish(e, second, row, column + 1, n_column) : 0;
+VLA_DEVICE void finish_pair(const Epilogue& e, const PairEnds& ends, float first, float second, std::int64_t row,
+                            int column) {
+  first = finish(e, first, ends.bias.x, ends.factor.x, ends.gate.x, ends.residual.x);
+  second = ends.has_second ? finish(e, second, ends.bias.y, ends.factor.y, ends.gate.y, ends.residual.y) : 0;
   const std::int64_t at = row * e.y_stride + column;
-  const bool together = has_second && e.y_stride % 2 == 0;
+  const bool together = ends.has_second && e.y_stride % 2 == 0;
   if (e.is_bf16) {
     const unsigned pair = dev::to_bf16(first, second);
     auto* y = static_cast<std::uint16_t*>(e.y) + at;
@@ -43,7 +65,7 @@ VLA_DEVICE void finish_pair(const Epilogue& e, float first, float second, std::i
       *reinterpret_cast<unsigned*>(y) = pair;
     } else {
       y[0] = static_cast<std::uint16_t>(pair);
-      if (has_second) y[1] = static_cast<std::uint16_t>(pair >> 16);
+      if (ends.has_second) y[1] = static_cast<std::uint16_t>(pair >> 16);
     }
   } else {
     auto* y = static_cast<float*>(e.y) + at;
@@ -51,9 +73,12 @@ VLA_DEVICE void finish_pair(const Epilogue& e, float first, float second, std::i
       *reinterpret_cast<float2*>(y) = float2{first, second};
     } else {
       y[0] = first;
-      if (has_second) y[1] = second;
+      if (ends.has_second) y[1] = second;
     }
   }
+}
+VLA_DEVICE void finish_pair(const Epilogue& e, float first, float second, std::int64_t row, int column, int n_column) {
+  finish_pair(e, load_ends(e, row, column, n_column), first, second, row, column);
 }
 
 }  // namespace vla::cuda

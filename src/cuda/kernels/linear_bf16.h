@@ -23,15 +23,26 @@ struct LinearBf16Job {
 };
 
 /// Rows of a block on tensor cores; few: up to kBf16FewRows rows in all, where reading the matrix once is the
-/// bottleneck.
-enum class Bf16Shape { few, rows64, rows128 };
+/// bottleneck. A strip has so many columns of up to 64 rows, in which a block has much of the depth on its way at once;
+/// depths are multiples of 8.
+enum class Bf16Shape { few, strip16, strip32, strip64, rows64, rows128 };
 constexpr int kBf16FewRows = 8;
 constexpr int kBf16Depth = 32;  // step of the depth, and unit of a split
+
+constexpr bool is_strip(Bf16Shape shape) {
+  return shape == Bf16Shape::strip16 || shape == Bf16Shape::strip32 || shape == Bf16Shape::strip64;
+}
 
 inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
   const auto splits = static_cast<unsigned>(job.n_split);
   if (shape == Bf16Shape::few)
     return {"linear_bf16_few", {blocks(job.n_column, 8), blocks(job.n_row, kBf16FewRows), splits}, 128};
+  if (is_strip(shape)) {
+    const unsigned columns = shape == Bf16Shape::strip16 ? 16 : shape == Bf16Shape::strip32 ? 32 : 64;
+    const char* name = columns == 16 ? "linear_strip_16" : columns == 32 ? "linear_strip_32" : "linear_strip_64";
+    const unsigned n_sum = columns == 64 ? 4 : 8;  // of warps that share columns
+    return {name, {blocks(job.n_column, columns), blocks(job.n_row, 64), splits}, 256, n_sum * 64 * (columns + 8) * 4};
+  }
   const unsigned size = shape == Bf16Shape::rows64 ? 64 : 128;
   return {shape == Bf16Shape::rows64 ? "linear_bf16_64" : "linear_bf16_128",
           {blocks(job.n_column, size), blocks(job.n_row, size), splits},

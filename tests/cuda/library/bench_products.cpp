@@ -110,8 +110,12 @@ class Bench {
     VLA_TRY(const Buffer x_few, timer_.upload(numbers_.floats(size.n_row * stride)));
     VLA_TRY(const auto matrices, fill_matrices(bytes(2 * size.n_column * stride), numbers_.bf16(kPattern / 2)));
     for (const int n_split : kSplits)
-      for (const auto& [name, shape] :
-           {std::pair{"few", Bf16Shape::few}, {"64", Bf16Shape::rows64}, {"128", Bf16Shape::rows128}}) {
+      for (const auto& [name, shape] : {std::pair{"few", Bf16Shape::few},
+                                        {"strip 16", Bf16Shape::strip16},
+                                        {"strip 32", Bf16Shape::strip32},
+                                        {"strip 64", Bf16Shape::strip64},
+                                        {"64", Bf16Shape::rows64},
+                                        {"128", Bf16Shape::rows128}}) {
         if (shape == Bf16Shape::few && size.n_row > 4 * kBf16FewRows) continue;
         std::vector<LinearBf16Job> jobs;
         for (const Buffer& matrix : matrices)

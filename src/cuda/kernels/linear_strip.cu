@@ -1,0 +1,161 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/kernels/share.h"
+
+namespace vla::cuda {
+namespace {
+
+constexpr int kWarps = 8, kThreads = kWarps * kLanes, kStripRows = 64, kTilesM = kStripRows / 16;
+
+/// A block has kColumns columns of up to 64 rows. Its warps have kTilesN * 8 of the columns each, and take the depth's
+/// steps in turn with those that have the same columns.
+template <int kTilesN_, int kWarpsN_>
+struct Strip {
+  static constexpr int kTilesN = kTilesN_, kWarpsN = kWarpsN_, kWarpsK = kWarps / kWarpsN;
+  static constexpr int kColumns = kTilesN * 8 * kWarpsN;
+  static constexpr int kRowBytes = (kColumns + 8) * 4;  // of sums in shared memory, padded against bank conflicts
+};
+
+/// What a lane loads in a step: 16 bytes, eight elements, of each of its rows and columns. A product's order of the
+/// depth is free, so that it takes them as they lie: the first four in one product of 16, the others in the next.
+template <class S>
+class Operands {
+ public:
+  /// Of a block's rows and columns those of a warp, from column of_warp of the block on.
+  VLA_DEVICE Operands(const LinearBf16Job& job, int row0, int column0, int of_warp)
+      : x_(static_cast<const std::byte*>(job.x) + row0 * job.x_stride * 2),
+        weight_(reinterpret_cast<const std::byte*>(job.weight) + column0 * job.weight_stride * 2),
+        n_chunk_(job.depth / 8) {
+    const int lane = thread_index() % kLanes;
+    // Rows and columns behind the last read that one; their sums are not stored.
+    const auto place = [&](int first, int of, int n, std::int64_t stride) {
+      const int last = n - 1 - first;
+      return static_cast<unsigned>((of + lane / 4 < last ? of + lane / 4 : last) * stride * 2);
+    };
+#pragma unroll
+    for (int r = 0; r < 2 * kTilesM; ++r) x_place_[r] = place(row0, r * 8, job.n_row, job.x_stride);
+#pragma unroll
+    for (int n = 0; n < S::kTilesN; ++n)
+      weight_place_[n] = place(column0, of_warp + n * 8, job.n_column, job.weight_stride);
+  }
+
+  struct Step {
+    uint4 x[2 * kTilesM], weight[S::kTilesN];
+
+    VLA_DEVICE void multiply(float (&sum)[kTilesM][S::kTilesN][4]) const {
+#pragma unroll
+      for (int m = 0; m < kTilesM; ++m) {
+        const uint4 low = x[2 * m], high = x[2 * m + 1];
+        const unsigned first[4] = {low.x, high.x, low.y, high.y}, second[4] = {low.z, high.z, low.w, high.w};
+#pragma unroll
+        for (int n = 0; n < S::kTilesN; ++n) {
+          dev::multiply_bf16(sum[m][n], first, weight[n].x, weight[n].y);
+          dev::multiply_bf16(sum[m][n], second, weight[n].z, weight[n].w);
+        }
+      }
+    }
+  };
+  /// Behind the depth weights are zeros, and x is its beginning.
+  VLA_DEVICE void load_weight(Step& to, int step) const {
+    const int chunk = chunk_of(step);
+#pragma unroll
+    for (int n = 0; n < S::kTilesN; ++n)
+      to.weight[n] = chunk < n_chunk_ ? *reinterpret_cast<const uint4*>(weight_ + weight_place_[n] + chunk * 16)
+                                      : uint4{0, 0, 0, 0};
+  }
+  VLA_DEVICE void load_x(Step& to, int step) const {
+    const int chunk = chunk_of(step) < n_chunk_ ? chunk_of(step) : 0;
+#pragma unroll
+    for (int r = 0; r < 2 * kTilesM; ++r) to.x[r] = *reinterpret_cast<const uint4*>(x_ + x_place_[r] + chunk * 16);
+  }
+
+ private:
+  static VLA_DEVICE int chunk_of(int step) { return step * (kBf16Depth / 8) + thread_index() % 4; }
+
+  const std::byte *x_, *weight_;
+  unsigned x_place_[2 * kTilesM], weight_place_[S::kTilesN];
+  int n_chunk_;
+};
+
+/// Adds the sums of warps that share columns, in their order, and stores pairs of y.
+template <class S>
+VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
+  constexpr int kPairs = S::kColumns / 2, kOf = kStripRows * S::kRowBytes, kEach = kStripRows * kPairs / kThreads;
+  constexpr int kApart = kThreads / kPairs;  // rows between those of a thread
+  const int number = thread_index() / kPairs, column = thread_index() % kPairs * 2;
+  // Where a transaction reads two rows, they are two apart, in different banks.
+  const int first_row = kPairs == 8 ? (number & ~3) + number % 2 * 2 + number / 2 % 2 : number;
+  const auto valid = [&](int i) {
+    return row0 + first_row + i * kApart < job.n_row && column0 + column < job.n_column;
+  };
+  PairEnds ends[kEach];
+#pragma unroll
+  for (int i = 0; i < kEach; ++i)
+    if (job.n_split == 1 && valid(i))
+      ends[i] = load_ends(job.end, row0 + first_row + i * kApart, column0 + column, job.n_column);
+  __syncthreads();  // sums of all warps are there
+#pragma unroll
+  for (int i = 0; i < kEach; ++i) {
+    const int row = first_row + i * kApart;
+    float2 sum = {0, 0};
+#pragma unroll
+    for (int w = 0; w < S::kWarpsK; ++w) {
+      const auto pair = dev::read<float2>(dev::shared_memory() + w * kOf + row * S::kRowBytes + column * 4);
+      sum.x += pair.x, sum.y += pair.y;
+    }
+    if (!valid(i)) continue;
+    if (job.n_split == 1)
+      finish_pair(job.end, ends[i], sum.x, sum.y, row0 + row, column0 + column);
+    else
+      store_pair(job, sum.x, sum.y, row0 + row, column0 + column);
+  }
+}
+
+template <class S>
+VLA_DEVICE void multiply_strip(const LinearBf16Job& job) {
+  const int warp = thread_index() / kLanes, lane = thread_index() % kLanes;
+  const int row0 = static_cast<int>(blockIdx.y) * kStripRows, column0 = static_cast<int>(blockIdx.x) * S::kColumns;
+  const int of_warp = warp % S::kWarpsN * S::kTilesN * 8, of_k = warp / S::kWarpsN;
+  const Share share(job);
+  const Operands<S> operands(job, row0, column0, of_warp);
+
+  typename Operands<S>::Step ahead[2];
+  const int first = share.first + of_k;
+#pragma unroll
+  for (int i = 0; i < 2; ++i) operands.load_weight(ahead[i], first + i * S::kWarpsK);
+  dev::wait_for_earlier();
+#pragma unroll
+  for (int i = 0; i < 2; ++i) operands.load_x(ahead[i], first + i * S::kWarpsK);
+  float sum[kTilesM][S::kTilesN][4] = {};
+  for (int step = first; step < share.end; step += 2 * S::kWarpsK) {
+#pragma unroll
+    for (int i = 0; i < 2; ++i) {
+      const int now = step + i * S::kWarpsK, next = now + 2 * S::kWarpsK;
+      if (now < share.end) ahead[i].multiply(sum);
+      if (next < share.end) operands.load_weight(ahead[i], next), operands.load_x(ahead[i], next);
+    }
+  }
+
+  std::byte* room = dev::shared_memory() + of_k * kStripRows * S::kRowBytes;
+#pragma unroll
+  for (int m = 0; m < kTilesM; ++m)
+#pragma unroll
+    for (int n = 0; n < S::kTilesN; ++n)
+#pragma unroll
+      for (int high = 0; high < 2; ++high)
+        dev::write(room + (m * 16 + high * 8 + lane / 4) * S::kRowBytes + (of_warp + n * 8 + lane % 4 * 2) * 4,
+                   float2{sum[m][n][2 * high], sum[m][n][2 * high + 1]});
+  add_and_store<S>(job, row0, column0);
+}
+
+}  // namespace
+
+using Strip16 = Strip<2, 1>;
+using Strip32 = Strip<4, 1>;
+using Strip64 = Strip<4, 2>;
+
+VLA_EARLY_KERNEL(linear_strip_16, 256, 1, LinearBf16Job) { multiply_strip<Strip16>(job); }
+VLA_EARLY_KERNEL(linear_strip_32, 256, 1, LinearBf16Job) { multiply_strip<Strip32>(job); }
+VLA_EARLY_KERNEL(linear_strip_64, 256, 1, LinearBf16Job) { multiply_strip<Strip64>(job); }
+
+}  // namespace vla::cuda
