@@ -53,13 +53,20 @@ void each_lane(u32 active, F f) {
     for (; active != 0; active &= active - 1) f(std::countr_zero(active));
 }
 
+/// A result as a GPU leaves it: its NaN has bits of its own.
+template <class To>
+To result(To x) {
+  if constexpr (std::is_same_v<To, float>)
+    if (std::isnan(x)) return std::bit_cast<float>(0x7fffffff);
+  return x;
+}
 /// An operation lane by lane; kF has no state.
 template <auto kF, class To, class... From>
 void lanes(WarpState& w, const PtxInstruction& i) {
   [&]<std::size_t... kI>(std::index_sequence<kI...>) {
     To* to = w.lanes<To>(i.operand[0]);
     [&](const auto*... from) {
-      each_lane(w.active, [&](int l) { to[l] = kF(from[l]...); });
+      each_lane(w.active, [&](int l) { to[l] = result<To>(kF(from[l]...)); });
     }(w.lanes<From>(i.operand[kI + 1])...);
   }
   (std::index_sequence_for<From...>{});
@@ -377,6 +384,8 @@ const PtxOperation kOperations[] = {
     // Approximations: a GPU's differ from these in the last bits.
     {"rcp.approx.ftz.f32", "dd", ONE(float, float, 1 / a)},
     {"ex2.approx.ftz.f32", "dd", ONE(float, float, exp2f(a))},
+    {"setp.num.f32", "pdd", COMPARE(float, !std::isnan(a) && !std::isnan(b))},
+    {"setp.nan.f32", "pdd", COMPARE(float, std::isnan(a) || std::isnan(b))},
     {"ex2.approx.f32", "dd", ONE(float, float, exp2f(a))},
     {"dp4a.s32.s32", "dddd", THREE(u32, u32, static_cast<u32>(vla::cuda::dev::dot4(a, b, static_cast<int>(c))))},
     {"cp.async.cg.shared.global", "sgdd", copy_async},

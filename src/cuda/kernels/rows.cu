@@ -12,42 +12,168 @@ VLA_DEVICE float sum_of_block(float x, std::byte* room) {
   return across_warps(sum_of_warp(x), room, [](float a, float b) { return a + b; });
 }
 
-/// Writes a normalized row as codes, equal to quantize_row of kernels/quantized.h to the bit. `value(i)` is element i.
+/// Codes of a row are those of quantize_row in kernels/quantized.h, to the bit.
+constexpr float kRound = 12582912.0f;  // 1.5 * 2^23: adding it leaves an integer in the lowest bits, ties to even
+/// A value without its sign: such floats order like integers, with NaN above all.
+VLA_DEVICE int size_of(float x) { return dev::bits_of(x) & 0x7fffffff; }
+VLA_DEVICE float scale_of(int most) {
+  const float a = dev::float_of(most);
+  return dev::multiply(dev::divide(1.0f, a < 1e-5f ? 1e-5f : a), 127.0f);
+}
+/// The code of x. Bits of NaN are the device's own; the CPU's make code 0.
+VLA_DEVICE unsigned code_of(float x, float s) {
+  const float rounded = dev::add(dev::multiply(x, s), kRound);
+  return rounded == rounded ? static_cast<unsigned>(dev::bits_of(rounded)) & 0xff : 0;
+}
+VLA_DEVICE int as_signed(unsigned code) { return static_cast<int>(code << 24) >> 24; }
+/// The 64 bytes after the codes.
+VLA_DEVICE void store_scale(std::byte* end, float s, int sum) {
+  if (thread_index() >= 16) return;
+  const unsigned scale = s == s ? static_cast<unsigned>(dev::bits_of(s)) : 0x7fc00000;
+  reinterpret_cast<unsigned*>(end)[thread_index()] = thread_index() == 0   ? scale
+                                                     : thread_index() == 1 ? static_cast<unsigned>(sum)
+                                                                           : 0;
+}
+VLA_DEVICE int larger(int a, int b) { return a > b ? a : b; }
+VLA_DEVICE int sum_of(int a, int b) { return a + b; }
+
+/// Writes a normalized row as codes. `value(i)` is element i.
 template <class Value>
 VLA_DEVICE void store_codes(std::byte* y, int n, std::byte* room, Value value) {
-  constexpr float kRound = 12582912.0f;  // 1.5 * 2^23: adding it leaves an integer in the lowest bits, ties to even
   const int n_thread = static_cast<int>(blockDim.x), depth = (n + 63) / 64 * 64;
-  int most = 0;  // without their signs, floats order like integers, with NaN above all
-  for (int i = thread_index(); i < n; i += n_thread) {
-    const int size = dev::bits_of(value(i)) & 0x7fffffff;
-    most = size > most ? size : most;
-  }
+  int most = 0;
+  for (int i = thread_index(); i < n; i += n_thread) most = larger(size_of(value(i)), most);
   __syncthreads();
-  most = across_warps(most_of_warp(most), room, [](int a, int b) { return a > b ? a : b; });
-  const float a = dev::float_of(most);
-  const float s = dev::multiply(dev::divide(1.0f, a < 1e-5f ? 1e-5f : a), 127.0f);
+  const float s = scale_of(across_warps(most_of_warp(most), room, larger));
   int sum = 0;
   for (int i = thread_index() * 4; i < depth; i += n_thread * 4) {
     unsigned four = 0;
     for (int b = 0; b < 4; ++b) {
-      const float rounded = i + b < n ? dev::add(dev::multiply(value(i + b), s), kRound) : kRound;
-      const unsigned code = static_cast<unsigned>(dev::bits_of(rounded)) & 0xff;
-      four |= code << 8 * b;
-      sum += static_cast<int>(code << 24) >> 24;
+      const unsigned code = i + b < n ? code_of(value(i + b), s) : 0;
+      four |= code << 8 * b, sum += as_signed(code);
     }
     *reinterpret_cast<unsigned*>(y + i) = four;
   }
   __syncthreads();
-  sum = across_warps(sum_of_warp(sum), room, [](int one, int other) { return one + other; });
-  if (thread_index() < 16) {  // the 64 bytes after the codes
-    const unsigned word = thread_index() == 0   ? static_cast<unsigned>(dev::bits_of(s))
-                          : thread_index() == 1 ? static_cast<unsigned>(sum)
-                                                : 0;
-    reinterpret_cast<unsigned*>(y + depth)[thread_index()] = word;
+  store_scale(y + depth, s, across_warps(sum_of_warp(sum), room, sum_of));
+}
+
+/// Four adjacent values of a row, zeros behind its end. `whole`: all rows consist of aligned fours.
+VLA_DEVICE void load_four(float (&to)[4], const float* row, int i, int n, bool whole) {
+  if (whole && i < n) {
+    const float4 four = *reinterpret_cast<const float4*>(row + i);
+    to[0] = four.x, to[1] = four.y, to[2] = four.z, to[3] = four.w;
+  } else {
+    for (int k = 0; k < 4; ++k) to[k] = i + k < n ? row[i + k] : 0;
+  }
+}
+VLA_DEVICE bool is_aligned(const void* p, int bytes) { return reinterpret_cast<std::uint64_t>(p) % bytes == 0; }
+
+/// One reduction of a block; each has room of its own, so that one barrier is enough.
+constexpr int kReductionRoom = 32;
+template <class T, class Combine>
+VLA_DEVICE T reduce(T of_warp, int number, Combine combine) {
+  return across_warps(of_warp, dev::shared_memory() + number * kReductionRoom, combine);
+}
+VLA_DEVICE float sum_of_block(float x, int number) {
+  return reduce(sum_of_warp(x), number, [](float a, float b) { return a + b; });
+}
+
+/// The same for a row in registers.
+template <int kGroups>
+VLA_DEVICE void store_codes(std::byte* y, int n, const float (&x)[kGroups][4]) {
+  const int depth = (n + 63) / 64 * 64;
+  int most = 0;  // values behind the row's end are zeros, or NaN where a norm made it of a row with NaN
+#pragma unroll
+  for (int j = 0; j < kGroups; ++j)
+#pragma unroll
+    for (int k = 0; k < 4; ++k)
+      if (4 * (thread_index() + kNormThreads * j) + k < n) most = larger(size_of(x[j][k]), most);
+  const float s = scale_of(reduce(most_of_warp(most), 2, larger));
+  int sum = 0;
+#pragma unroll
+  for (int j = 0; j < kGroups; ++j) {
+    const int i = 4 * (thread_index() + kNormThreads * j);
+    unsigned four = 0;
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      const unsigned code = i + k < n ? code_of(x[j][k], s) : 0;
+      four |= code << 8 * k, sum += as_signed(code);
+    }
+    if (i < depth) *reinterpret_cast<unsigned*>(y + i) = four;
+  }
+  store_scale(y + depth, s, reduce(sum_of_warp(sum), 3, sum_of));
+}
+
+/// A row of up to kGroups * 1024 values in registers, four adjacent ones of each 1024 in a thread, so that all that is
+/// read is asked for at once.
+template <int kGroups>
+VLA_DEVICE void norm_in_registers(const NormJob& job) {
+  const std::int64_t row = blockIdx.x;
+  const int n = job.n;
+  const bool whole = n % 4 == 0 && job.x_stride % 4 == 0 && is_aligned(job.x, 16) && is_aligned(job.residual, 16) &&
+                     is_aligned(job.sum, 16) && is_aligned(job.weight, 16) && is_aligned(job.bias, 16);
+  const auto place = [](int j) { return 4 * (thread_index() + kNormThreads * j); };
+  float x[kGroups][4], residual[kGroups][4], weight[kGroups][4], bias[kGroups][4];
+#pragma unroll
+  for (int j = 0; j < kGroups; ++j) {
+    load_four(x[j], job.x + row * job.x_stride, place(j), n, whole);
+    if (job.residual) load_four(residual[j], job.residual + row * n, place(j), n, whole);
+    if (job.weight) load_four(weight[j], job.weight, place(j), n, whole);
+    if (job.bias) load_four(bias[j], job.bias, place(j), n, whole);
+  }
+  float sum = 0;
+#pragma unroll
+  for (int j = 0; j < kGroups; ++j) {
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      if (job.residual) x[j][k] += residual[j][k];
+      sum += x[j][k];
+      if (job.sum && !whole && place(j) + k < n) job.sum[row * n + place(j) + k] = x[j][k];
+    }
+    if (job.sum && whole && place(j) < n)
+      *reinterpret_cast<float4*>(job.sum + row * n + place(j)) = float4{x[j][0], x[j][1], x[j][2], x[j][3]};
+  }
+  float mean = 0, factor = 1;
+  if (job.norm == RowNorm::layer) mean = sum_of_block(sum, 0) / static_cast<float>(n);
+  if (job.norm != RowNorm::none) {
+    float squares = 0;
+#pragma unroll
+    for (int j = 0; j < kGroups; ++j)
+#pragma unroll
+      for (int k = 0; k < 4; ++k) squares += place(j) + k < n ? (x[j][k] - mean) * (x[j][k] - mean) : 0;
+    factor = 1 / sqrtf(sum_of_block(squares, 1) / static_cast<float>(n) + job.eps);
+  }
+#pragma unroll
+  for (int j = 0; j < kGroups; ++j)
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      x[j][k] = dev::multiply(x[j][k] - mean, factor);
+      if (job.weight) x[j][k] = dev::multiply(x[j][k], weight[j][k]);
+      if (job.bias) x[j][k] = dev::add(x[j][k], bias[j][k]);
+    }
+  if (job.type == RowType::codes) return store_codes(static_cast<std::byte*>(job.y) + row * job.y_stride, n, x);
+  const bool stores_four = n % 4 == 0 && job.y_stride % 4 == 0 && is_aligned(job.y, 16);
+#pragma unroll
+  for (int j = 0; j < kGroups; ++j) {
+    const std::int64_t to = row * job.y_stride + place(j);
+    if (place(j) >= n) continue;
+    if (!stores_four) {
+      for (int k = 0; k < 4; ++k)
+        if (place(j) + k < n) store(job.y, job.type == RowType::bf16, to + k, x[j][k]);
+    } else if (job.type == RowType::bf16) {
+      *reinterpret_cast<uint2*>(static_cast<std::uint16_t*>(job.y) + to) =
+          uint2{dev::to_bf16(x[j][0], x[j][1]), dev::to_bf16(x[j][2], x[j][3])};
+    } else {
+      *reinterpret_cast<float4*>(static_cast<float*>(job.y) + to) = float4{x[j][0], x[j][1], x[j][2], x[j][3]};
+    }
   }
 }
 
 }  // namespace
+
+VLA_KERNEL(norm_rows_2, 256, 4, NormJob) { norm_in_registers<2>(job); }
+VLA_KERNEL(norm_rows_8, 256, 1, NormJob) { norm_in_registers<8>(job); }
 
 /// A block computes one row, which stays in shared memory if it fits.
 VLA_KERNEL(norm_rows, 256, 4, NormJob) {
@@ -116,7 +242,8 @@ VLA_KERNEL(lookup_rows, 128, 8, LookupJob) {
   const std::int64_t row = blockIdx.x;
   const int id = job.ids[row];
   const bool valid = id >= 0 && id < job.n_table;
-  for (int i = thread_index(); i < job.n; i += 128) {
+  const int first = static_cast<int>(blockIdx.y) * kLookupBlock, end = first + kLookupBlock;
+  for (int i = first + thread_index(); i < job.n && i < end; i += 128) {
     const std::int64_t at = static_cast<std::int64_t>(valid ? id : 0) * job.n + i;
     float value = 0;
     if (job.type == TableType::f32) {

@@ -25,7 +25,10 @@ struct NormJob {
   RowType type;
 };
 constexpr int kMaxKept = 24576;  // wider rows are read again; narrower ones stay in shared memory
+constexpr int kNormThreads = 256;
 inline Launch norm_rows(const NormJob& job) {
+  if (job.n <= 8192)  // a row in registers
+    return {job.n <= 2048 ? "norm_rows_2" : "norm_rows_8", {static_cast<unsigned>(job.n_row)}, kNormThreads, 128};
   const int n_kept = job.n <= kMaxKept ? job.n : 0;
   return {"norm_rows", {static_cast<unsigned>(job.n_row)}, 256, static_cast<unsigned>(n_kept * 4 + 64)};
 }
@@ -56,6 +59,9 @@ struct LookupJob {
   int n_row, n_table, n;
   TableType type;
 };
-inline Launch lookup_rows(const LookupJob& job) { return {"lookup_rows", {static_cast<unsigned>(job.n_row)}, 128}; }
+constexpr int kLookupBlock = 1024;  // elements of a row that a block looks up
+inline Launch lookup_rows(const LookupJob& job) {
+  return {"lookup_rows", {static_cast<unsigned>(job.n_row), blocks(job.n, kLookupBlock)}, 128};
+}
 
 }  // namespace vla::cuda

@@ -52,9 +52,21 @@ struct CudaLowering : Lowering {
 /// rounded is stored so at once. Also how the depth of a product is split.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 
-/// How blocks of a product cut rows: in 128, in 64, or few rows bound by reading the matrix.
-enum class ProductShape { few, rows64, rows128 };
-ProductShape product_shape(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, int n_sm);
+/// How blocks of a product cut rows: in 128, in 64, or few rows bound by reading the matrix; strips are of so many
+/// columns of up to 64 rows. And how many shares of the depth have blocks of their own.
+enum class ProductShape { few, strip16, strip32, strip64, rows64, rows128 };
+/// Columns of a strip; 0 for other shapes.
+constexpr std::int64_t strip_width(ProductShape shape) {
+  return shape == ProductShape::strip16   ? 16
+         : shape == ProductShape::strip32 ? 32
+         : shape == ProductShape::strip64 ? 64
+                                          : 0;
+}
+struct ProductCut {
+  ProductShape shape;
+  int n_split;
+};
+ProductCut cut_product(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
 
 /// How blocks cut rows of queries and shares of keys.
 struct AttentionPlan {

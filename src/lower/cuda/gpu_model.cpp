@@ -63,6 +63,8 @@ constexpr GpuModel kModels[] = {
 
 // Assumptions, never measured: issue slots that a quarter of an SM fills where nothing else holds it up; the time of
 // the smallest kernel from its first block to its last, in cycles; how long memory takes to answer.
+// What an SM reads from the second-level cache in a cycle.
+constexpr double kSmBytes = 56;
 constexpr double kIssue = 0.75, kKernelCycles = 4000, kMemoryLatency = 0.8 * kMicro;
 
 /// The main loop of a kernel on tensor cores, whose blocks have a warp or two for each quarter of an SM. The counts are
@@ -147,12 +149,16 @@ class Costs {
       const MatrixKind kind = l.matrix(*node).kind;
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
       const bool has_codes = kind == MatrixKind::ternary || kind == MatrixKind::int8;
-      const ProductShape shape = product_shape(kind, rows, columns, l.n_sm);
+      const ProductShape shape = cut_product(kind, rows, columns, weight.shape[0], l.n_sm).shape;
       const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
       if (kind == MatrixKind::f32) {  // rows and columns behind the last are multiplied as well
         const double padded = tiles * static_cast<double>(size * size) * 2 * static_cast<double>(weight.shape[0]);
         add_blocks(cost, tiles, padded / tiles / (gpu.f32 / gpu.n_sm));
+      } else if (const std::int64_t width = strip_width(shape); width > 0) {
+        const std::int64_t n_block = (columns + width - 1) / width * ((rows + 63) / 64) * op.n_split;
+        const std::int64_t bytes = (std::min<std::int64_t>(rows, 64) + width) * weight.shape[0] * 2 / op.n_split;
+        add_blocks(cost, static_cast<double>(n_block), static_cast<double>(bytes) / (kSmBytes * gpu.clock));
       } else if (shape == ProductShape::few) {
         add_blocks(cost, gpu.n_sm, flop_of(*node) / (has_codes ? gpu.dot4 : gpu.f32));
       } else {

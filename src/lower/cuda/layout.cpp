@@ -1,6 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
+#include <limits>
 #include <map>
 
 #include "cuda/kernels/linear_bf16.h"
@@ -61,10 +62,10 @@ class CudaLayouts final : Layouts {
     const MatrixKind kind = l.matrix(*op.linears[0]).kind;
     const Shape y = op.linears[0]->shape;
     const std::int64_t depth = l.value(op.x).shape[0], n_row = count(y) / y[0];
-    const bool is_few = product_shape(kind, n_row, y[0], l.n_sm) == ProductShape::few;
+    const ProductCut cut = cut_product(kind, n_row, y[0], depth, l.n_sm);
     if (kind == MatrixKind::ternary || kind == MatrixKind::int8)
       round(step, op, DType::i8, kernels::quantized_stride(depth), "round");
-    else if (kind == MatrixKind::bf16 && !is_few)
+    else if (kind == MatrixKind::bf16 && cut.shape != ProductShape::few)
       round(step, op, DType::bf16, bf16_stride(depth), "round");
     else if (op.norm != nullptr)
       round(step, op, DType::f32, depth, "round");
@@ -72,26 +73,13 @@ class CudaLayouts final : Layouts {
     const bool gated = op.gated;
     CudaOp& made = l.ops.emplace_back(CudaOp{std::move(step), std::move(op)});
     if (gated) made.writes.push_back(made.gate = add_rows(y));
-    split(made, splits(kind, n_row, y[0], depth), y[0] * n_row);
+    split(made, cut.n_split, y[0] * n_row);
   }
   /// n: floats that each share of a product or of attention leaves.
   void split(CudaOp& op, int n_split, std::int64_t n) {
     op.n_split = n_split;
     if (n_split > 1) op.writes.push_back(op.partial = add_rows({n, n_split, 1, 1}));
   }
-  /// The number of shares of the depth, each of 8 steps or more: 1 unless blocks are fewer than run at a time.
-  int splits(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth) const {
-    if (kind == MatrixKind::f32) return 1;
-    const ProductShape shape = product_shape(kind, n_row, n_column, l.n_sm);
-    const std::int64_t step = kind == MatrixKind::bf16 ? cuda::kBf16Depth : cuda::Int8Tile::kDepth;
-    std::int64_t n_block = (n_column + 63) / 64 * ((n_row + 63) / 64);
-    if (shape == ProductShape::rows128) n_block = (n_column + 127) / 128 * ((n_row + 127) / 128);
-    if (shape == ProductShape::few) n_block = kind == MatrixKind::bf16 ? (n_column + 7) / 8 : (n_column + 127) / 128;
-    const std::int64_t most = (depth + step - 1) / step / 8;
-    return static_cast<int>(
-        std::clamp<std::int64_t>(l.n_sm / std::max<std::int64_t>(n_block, 1), 1, std::max<std::int64_t>(most, 1)));
-  }
-
   /// Rounds the result of a product, attention or a window as it is stored, where nobody else reads it.
   void round_at_once(CudaOp& round, const RoundOp& what) {
     const Value &x = l.value(what.x), &to = l.value(round.writes[0]);
@@ -149,12 +137,47 @@ class CudaLayouts final : Layouts {
   std::map<ValueId, int> n_reader_;  // of each base and its views
 };
 
+/// Rows from which on tiles of both operands in shared memory are worth their barriers.
+constexpr std::int64_t kMostStripRows = 192;
+
+std::int64_t blocks_of(std::int64_t n_row, std::int64_t n_column, std::int64_t rows, std::int64_t columns) {
+  return (n_row + rows - 1) / rows * ((n_column + columns - 1) / columns);
+}
+
+/// The strips, and shares of the depth, whose SMs have least to read, one block after the other. A kernel that adds
+/// shares takes as long as kFinish bytes.
+ProductCut cut_in_strips(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
+  constexpr std::int64_t kFinish = 220'000;
+  ProductCut best = {ProductShape::strip16, 1};
+  std::int64_t least = std::numeric_limits<std::int64_t>::max();
+  for (const auto& [shape, width] :
+       {std::pair{ProductShape::strip16, 16}, {ProductShape::strip32, 32}, {ProductShape::strip64, 64}})
+    for (const int n_split : {1, 2, 4, 8}) {
+      const std::int64_t n_block = blocks_of(n_row, n_column, 64, width) * n_split;
+      const std::int64_t of_block = (std::min<std::int64_t>(n_row, 64) + width) * depth * 2 / n_split;
+      const std::int64_t cost = (n_block + n_sm - 1) / n_sm * of_block + (n_split > 1 ? kFinish : 0);
+      if (cost < least) least = cost, best = {shape, n_split};
+    }
+  return best;
+}
+
 }  // namespace
 
-ProductShape product_shape(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, int n_sm) {
-  if (n_row <= (kind == MatrixKind::bf16 ? cuda::kBf16FewRows : 4)) return ProductShape::few;
-  const std::int64_t n_block = (n_row + 127) / 128 * ((n_column + 127) / 128);
-  return n_row > 64 && n_block >= n_sm ? ProductShape::rows128 : ProductShape::rows64;
+ProductCut cut_product(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
+  const bool is_bf16 = kind == MatrixKind::bf16, is_few = n_row <= (is_bf16 ? cuda::kBf16FewRows : 4);
+  if (is_bf16 && !is_few && n_row <= kMostStripRows && depth % 8 == 0)
+    return cut_in_strips(n_row, n_column, depth, n_sm);
+  const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
+  const ProductShape shape = is_few                          ? ProductShape::few
+                             : n_row > 64 && n_large >= n_sm ? ProductShape::rows128
+                                                             : ProductShape::rows64;
+  if (kind == MatrixKind::f32) return {shape, 1};
+  std::int64_t n_block = shape == ProductShape::rows128 ? n_large : blocks_of(n_row, n_column, 64, 64);
+  if (is_few) n_block = blocks_of(1, n_column, 1, is_bf16 ? 8 : 128);
+  // Shares are of 8 steps or more, and one unless blocks are fewer than run at a time.
+  const std::int64_t step = is_bf16 ? cuda::kBf16Depth : cuda::Int8Tile::kDepth;
+  const std::int64_t most = std::max<std::int64_t>((depth + step - 1) / step / 8, 1);
+  return {shape, static_cast<int>(std::clamp<std::int64_t>(n_sm / std::max<std::int64_t>(n_block, 1), 1, most))};
 }
 
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops) { CudaLayouts(l).run(std::move(ops)); }

@@ -9,17 +9,34 @@
 namespace vla::lower {
 namespace {
 
-/// Blocks of a kernel, by their shape: those of few rows, of 64, of 128.
-template <class Tile>
-Tile tile_of(ProductShape shape) {
-  return shape == ProductShape::few ? Tile::few : shape == ProductShape::rows64 ? Tile::rows64 : Tile::rows128;
+cuda::Bf16Shape bf16_shape(ProductShape shape) {
+  switch (shape) {
+    case ProductShape::few:
+      return cuda::Bf16Shape::few;
+    case ProductShape::strip16:
+      return cuda::Bf16Shape::strip16;
+    case ProductShape::strip32:
+      return cuda::Bf16Shape::strip32;
+    case ProductShape::strip64:
+      return cuda::Bf16Shape::strip64;
+    case ProductShape::rows64:
+      return cuda::Bf16Shape::rows64;
+    case ProductShape::rows128:
+      break;
+  }
+  return cuda::Bf16Shape::rows128;
+}
+cuda::Int8Shape int8_shape(ProductShape shape) {
+  return shape == ProductShape::few      ? cuda::Int8Shape::few
+         : shape == ProductShape::rows64 ? cuda::Int8Shape::rows64
+                                         : cuda::Int8Shape::rows128;
 }
 
 void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const CudaWeight& matrix, const Param& weight,
                  const cuda::Epilogue& end, Calls& calls) {
   const Value& x = l.value(of);
   const int rows = narrow(rows_of(x.shape)), columns = narrow(weight.shape[1]), depth = narrow(x.shape[0]);
-  const ProductShape shape = product_shape(matrix.kind, rows, columns, l.n_sm);
+  const ProductShape shape = cut_product(matrix.kind, rows, columns, depth, l.n_sm).shape;
   switch (matrix.kind) {
     case MatrixKind::f32: {
       const cuda::LinearF32Job job = {.x = l.at(of),
@@ -43,7 +60,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .n_split = op.n_split,
                                        .partial = l.at(op.partial),
                                        .end = end};
-      calls.push_back(call(cuda::linear_bf16(tile_of<cuda::Bf16Shape>(shape), job), job));
+      calls.push_back(call(cuda::linear_bf16(bf16_shape(shape), job), job));
       if (job.n_split > 1) calls.push_back(call(cuda::finish_bf16_partial(job), job));
       return;
     }
@@ -60,7 +77,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .partial = l.at<int>(op.partial),
                                        .end = end};
       const auto kind = matrix.kind == MatrixKind::ternary ? cuda::CodeKind::ternary : cuda::CodeKind::int8;
-      calls.push_back(call(cuda::linear_int8(kind, tile_of<cuda::Int8Shape>(shape), job), job));
+      calls.push_back(call(cuda::linear_int8(kind, int8_shape(shape), job), job));
       if (job.n_split > 1) calls.push_back(call(cuda::finish_int8_partial(job), job));
       return;
     }
