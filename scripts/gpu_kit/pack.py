@@ -46,8 +46,11 @@ def copy_programs(build, kit):
     for file in files:
         if not file.is_file():
             sys.exit(f"error: {file}: expected what make cuda builds, found nothing")
-        if file.name not in ("vla", "libvla.so.1") and b"\n.version 8.5" not in file.read_bytes():
-            sys.exit(f"error: {file}: expected PTX inside, found none, as before make cuda; build it again")
+        if file.name not in ("vla", "libvla.so.1"):
+            inside = file.read_bytes()
+            for ptx in (build / "src/cuda/ptx").glob("*.ptx"):
+                if ptx.read_bytes() not in inside:
+                    sys.exit(f"error: {file}: expected {ptx.name} of this build inside, found none or another; make cuda again")
         shutil.copy(file, kit / "bin" / file.name)
         run("strip", "--strip-unneeded", kit / "bin" / file.name)
     for file in files:
