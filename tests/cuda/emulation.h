@@ -98,6 +98,7 @@ namespace vla::cuda::dev {
 
 using test::cuda::commit_copies, test::cuda::shared_memory;
 inline void wait_for_earlier() {}
+inline void let_next_begin() {}
 template <class T>
 T read(const std::byte* p) {
   test::cuda::check_shared(p, sizeof(T), false);

@@ -12,14 +12,15 @@
 #define VLA_DEVICE __device__ __forceinline__
 /// Defines a kernel with one parameter, `job`, under an unmangled name: at most `threads` threads per block, registers
 /// for `blocks` blocks.
-#define VLA_KERNEL(name, threads, blocks, Job)   \
-  VLA_DEVICE void name##_body(const Job& job);   \
-  VLA_EARLY_KERNEL(name, threads, blocks, Job) { \
-    dev::wait_for_earlier();                     \
-    name##_body(job);                            \
-  }                                              \
+#define VLA_KERNEL(name, threads, blocks, Job)      \
+  VLA_DEVICE void name##_body(const Job& job);      \
+  VLA_EARLY_KERNEL(name, threads, blocks, Job) {    \
+    dev::wait_for_earlier(), dev::let_next_begin(); \
+    name##_body(job);                               \
+  }                                                 \
   VLA_DEVICE void name##_body(const Job& job)
-/// The same for one that itself calls wait_for_earlier(), and before it reads nothing but weights and writes nothing.
+/// The same for one that itself calls wait_for_earlier(), and before it reads nothing but weights and writes nothing,
+/// and let_next_begin().
 #define VLA_EARLY_KERNEL(name, threads, blocks, Job) \
   extern "C" __global__ void __launch_bounds__(threads, blocks) name(const __grid_constant__ Job job)
 
@@ -30,13 +31,19 @@ VLA_DEVICE std::byte* shared_memory() {
   extern __shared__ __align__(1024) std::byte bytes[];
   return bytes;
 }
-/// Lets the stream's next kernel begin, which waits here until this one has ended, and waits for the kernel before this
-/// one, with all that it wrote. Every thread must call it before it reads results of kernels or writes. Before Hopper
-/// kernels do not overlap.
+/// Waits for the stream's kernel before this one, with all that it wrote. Every thread must call it before it reads
+/// results of kernels or writes. Before Hopper kernels do not overlap.
 VLA_DEVICE void wait_for_earlier() {
 #if __CUDA_ARCH__ >= 900
-  asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
   asm volatile("griddepcontrol.wait;" ::: "memory");
+#endif
+}
+/// The stream's next kernel may begin, up to its own wait_for_earlier(), once all blocks of this one have called it.
+/// Kernels of many blocks call it when little is left to do: blocks of the next one crowd together where others have
+/// ended already.
+VLA_DEVICE void let_next_begin() {
+#if __CUDA_ARCH__ >= 900
+  asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
 #endif
 }
 VLA_DEVICE unsigned shared_address(const void* p) { return static_cast<unsigned>(__cvta_generic_to_shared(p)); }

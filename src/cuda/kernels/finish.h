@@ -22,11 +22,11 @@ VLA_DEVICE float activate(Activation activation, float x) {
 /// What an epilogue reads for two adjacent columns of a row, so that it can be asked for before the sums are there.
 struct PairEnds {
   float2 bias = {0, 0}, factor = {1, 1}, gate = {0, 0}, residual = {0, 0};
-  bool has_second;
+  bool has_second, has_gate;
 };
 VLA_DEVICE PairEnds load_ends(const Epilogue& e, std::int64_t row, int column, int n_column) {
   PairEnds ends;
-  ends.has_second = column + 1 < n_column;
+  ends.has_second = column + 1 < n_column, ends.has_gate = e.gate != nullptr;
   const auto load = [&](const float* from, std::int64_t at, float2& to) {
     if (from == nullptr) return;
     if (at % 2 == 0 && ends.has_second && reinterpret_cast<std::uint64_t>(from) % 8 == 0) {
@@ -43,9 +43,10 @@ VLA_DEVICE PairEnds load_ends(const Epilogue& e, std::int64_t row, int column, i
 }
 
 /// y of one sum. Products and sums are not fused, so y without an activation equals the CPU's to the bit.
-VLA_DEVICE float finish(const Epilogue& e, float sum, float bias, float factor, float gate, float residual) {
+VLA_DEVICE float finish(const Epilogue& e, bool has_gate, float sum, float bias, float factor, float gate,
+                        float residual) {
   if (e.bias) sum = dev::add(sum, bias);
-  sum = e.gate ? dev::multiply(activate(e.activation, gate), sum) : activate(e.activation, sum);
+  sum = has_gate ? dev::multiply(activate(e.activation, gate), sum) : activate(e.activation, sum);
   if (e.factor) sum = dev::multiply(sum, factor);
   if (e.residual) sum = dev::add(sum, residual);
   return e.ends_in_relu ? activate(Activation::relu, sum) : sum;
@@ -54,8 +55,9 @@ VLA_DEVICE float finish(const Epilogue& e, float sum, float bias, float factor, 
 /// Stores y of two adjacent sums; the second may be after the last column.
 VLA_DEVICE void finish_pair(const Epilogue& e, const PairEnds& ends, float first, float second, std::int64_t row,
                             int column) {
-  first = finish(e, first, ends.bias.x, ends.factor.x, ends.gate.x, ends.residual.x);
-  second = ends.has_second ? finish(e, second, ends.bias.y, ends.factor.y, ends.gate.y, ends.residual.y) : 0;
+  const bool has_gate = ends.has_gate;
+  first = finish(e, has_gate, first, ends.bias.x, ends.factor.x, ends.gate.x, ends.residual.x);
+  second = ends.has_second ? finish(e, has_gate, second, ends.bias.y, ends.factor.y, ends.gate.y, ends.residual.y) : 0;
   const std::int64_t at = row * e.y_stride + column;
   const bool together = ends.has_second && e.y_stride % 2 == 0;
   if (e.is_bf16) {

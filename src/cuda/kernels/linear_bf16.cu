@@ -67,6 +67,7 @@ VLA_DEVICE void multiply_stage(const std::byte* stage, int warp_row, int warp_co
 
 template <class S>
 VLA_DEVICE void multiply(const LinearBf16Job& job) {
+  dev::wait_for_earlier();
   std::byte* shared = dev::shared_memory();
   const int warp = thread_index() / kLanes;
   const int warp_row = warp % 2 * S::kTilesM * 16, warp_column = warp / 2 * S::kTilesN * 8;
@@ -90,6 +91,7 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
     multiply_stage<S>(shared + i % S::kStages * S::kStage, warp_row, warp_column, sum);
   }
 
+  dev::let_next_begin();
   dev::wait_copies<0>();
   __syncthreads();  // the stages' memory is reused for sums
   store_sums(sum, shared + warp * kSumBytes<S::kTilesN>, [&](int row, int column, float first, float second) {
@@ -159,22 +161,43 @@ VLA_DEVICE void multiply_few(const LinearBf16Job& job) {
 using Shape128 = Shape<4, 8>;
 using Shape64 = Shape<2, 4>;
 
-VLA_KERNEL(linear_bf16_128, 128, 2, LinearBf16Job) { multiply<Shape128>(job); }
-VLA_KERNEL(linear_bf16_64, 128, 4, LinearBf16Job) { multiply<Shape64>(job); }
+VLA_EARLY_KERNEL(linear_bf16_128, 128, 2, LinearBf16Job) { multiply<Shape128>(job); }
+VLA_EARLY_KERNEL(linear_bf16_64, 128, 4, LinearBf16Job) { multiply<Shape64>(job); }
 VLA_KERNEL(linear_bf16_few, 128, 4, LinearBf16Job) { multiply_few(job); }
 
 /// Adds the partial sums of a split and computes y.
 VLA_KERNEL(linear_bf16_finish, 128, 4, LinearBf16Job) {
   const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 2;
   if (column >= job.n_column) return;
-  const bool has_second = column + 1 < job.n_column;
-  float first = 0, second = 0;
-  for (int z = 0; z < job.n_split; ++z) {
-    const float* from = job.partial + (static_cast<std::int64_t>(z) * job.n_row + row) * job.n_column + column;
-    first += from[0];
-    if (has_second) second += from[1];
+  PairEnds ends = load_ends(job.end, row, column, job.n_column);
+  const auto add = [&](int at) {
+    const bool is_pair = ends.has_second && (job.n_sum() | at) % 2 == 0;
+    const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * job.n_sum();
+    const float* from = job.partial + static_cast<std::int64_t>(row) * job.n_sum() + at;
+    float2 share[kMostSplits], sum = {0, 0};
+#pragma unroll
+    for (int z = 0; z < kMostSplits; ++z) {  // all are asked for before any is added
+      share[z] = {0, 0};
+      if (z >= job.n_split) continue;
+      if (is_pair)
+        share[z] = *reinterpret_cast<const float2*>(from + z * apart);
+      else
+        share[z] = {from[z * apart], ends.has_second ? from[z * apart + 1] : 0};
+    }
+#pragma unroll
+    for (int z = 0; z < kMostSplits; ++z) sum.x += share[z].x, sum.y += share[z].y;
+    for (int z = kMostSplits; z < job.n_split; ++z) {
+      sum.x += from[z * apart];
+      if (ends.has_second) sum.y += from[z * apart + 1];
+    }
+    return sum;
+  };
+  if (job.gate_weight) {
+    ends.gate = add(column), ends.has_gate = true;
+    add_gate_bias(job, ends, column);
   }
-  finish_pair(job.end, first, second, row, column, job.n_column);
+  const float2 sum = add(job.n_sum() - job.n_column + column);
+  finish_pair(job.end, ends, sum.x, sum.y, row, column);
 }
 
 }  // namespace vla::cuda

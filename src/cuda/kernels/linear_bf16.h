@@ -20,29 +20,52 @@ struct LinearBf16Job {
   int n_split;
   float* partial;
   Epilogue end;
+  /// Of strips alone: y = activation(x gate^T + gate_bias) * (x w^T + bias) and so on, in the place of a gate that is
+  /// there already. Partial sums of the gate stand before the others in a row of 2 n_column.
+  const std::uint16_t* gate_weight = nullptr;
+  const float* gate_bias = nullptr;
+
+  VLA_HOST_DEVICE int n_sum() const { return gate_weight ? 2 * n_column : n_column; }  // of a row
 };
 
 /// Rows of a block on tensor cores; few: up to kBf16FewRows rows in all, where reading the matrix once is the
 /// bottleneck. A strip has so many columns of up to 64 rows, in which a block has much of the depth on its way at once;
 /// depths are multiples of 8.
-enum class Bf16Shape { few, strip16, strip32, strip64, rows64, rows128 };
+enum class Bf16Shape { few, strip16, strip32, strip64, strip128, rows64, rows128 };
 constexpr int kBf16FewRows = 8;
 constexpr int kBf16Depth = 32;  // step of the depth, and unit of a split
 
-constexpr bool is_strip(Bf16Shape shape) {
-  return shape == Bf16Shape::strip16 || shape == Bf16Shape::strip32 || shape == Bf16Shape::strip64;
+/// Columns of a strip, half of them the gate's where there is one; 0 for other shapes.
+constexpr unsigned strip_width(Bf16Shape shape) {
+  switch (shape) {
+    case Bf16Shape::strip16:
+      return 16;
+    case Bf16Shape::strip32:
+      return 32;
+    case Bf16Shape::strip64:
+      return 64;
+    case Bf16Shape::strip128:
+      return 128;
+    default:
+      return 0;
+  }
 }
-
+inline Launch linear_strip(unsigned width, const LinearBf16Job& job) {
+  constexpr const char* kNames[2][4] = {
+      {"linear_strip_16", "linear_strip_32", "linear_strip_64", "linear_strip_128"},
+      {"linear_strip_16_gated", "linear_strip_32_gated", "linear_strip_64_gated", "linear_strip_128_gated"}};
+  const int which = width == 16 ? 0 : width == 32 ? 1 : width == 64 ? 2 : 3;
+  const unsigned n_sum = width == 128 ? 2 : width == 64 ? 4 : 8;  // of warps that share columns
+  return {kNames[job.gate_weight != nullptr][which],
+          {blocks(job.n_sum(), width), blocks(job.n_row, 64), static_cast<unsigned>(job.n_split)},
+          256,
+          n_sum * 64 * (width + 8) * 4};
+}
 inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
   const auto splits = static_cast<unsigned>(job.n_split);
   if (shape == Bf16Shape::few)
     return {"linear_bf16_few", {blocks(job.n_column, 8), blocks(job.n_row, kBf16FewRows), splits}, 128};
-  if (is_strip(shape)) {
-    const unsigned columns = shape == Bf16Shape::strip16 ? 16 : shape == Bf16Shape::strip32 ? 32 : 64;
-    const char* name = columns == 16 ? "linear_strip_16" : columns == 32 ? "linear_strip_32" : "linear_strip_64";
-    const unsigned n_sum = columns == 64 ? 4 : 8;  // of warps that share columns
-    return {name, {blocks(job.n_column, columns), blocks(job.n_row, 64), splits}, 256, n_sum * 64 * (columns + 8) * 4};
-  }
+  if (const unsigned width = strip_width(shape)) return linear_strip(width, job);
   const unsigned size = shape == Bf16Shape::rows64 ? 64 : 128;
   return {shape == Bf16Shape::rows64 ? "linear_bf16_64" : "linear_bf16_128",
           {blocks(job.n_column, size), blocks(job.n_row, size), splits},

@@ -125,6 +125,7 @@ VLA_DEVICE void multiply_stage(const std::byte* stage, int warp_row, int warp_co
 
 template <class S>
 VLA_DEVICE void multiply(const LinearInt8Job& job) {
+  dev::wait_for_earlier();
   std::byte* shared = dev::shared_memory();
   const int warp = thread_index() / kLanes;
   const int warp_row = warp % 2 * S::kTilesM * 16, warp_column = warp / 2 * S::kTilesN * 8;
@@ -149,6 +150,7 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
     next = next + 1 == S::kStages ? 0 : next + 1;
   }
 
+  dev::let_next_begin();
   dev::wait_copies<0>();
   __syncthreads();  // the stages' memory is reused for sums
   store_sums(sum, shared + warp * kSumBytes<S::kTilesN>, [&](int row, int column, int first, int second) {
@@ -221,10 +223,10 @@ using Ternary64 = Shape<CodeKind::ternary, 2, 4>;
 using Bytes128 = Shape<CodeKind::int8, 4, 8>;
 using Bytes64 = Shape<CodeKind::int8, 2, 4>;
 
-VLA_KERNEL(linear_ternary_128, 128, 2, LinearInt8Job) { multiply<Ternary128>(job); }
-VLA_KERNEL(linear_ternary_64, 128, 4, LinearInt8Job) { multiply<Ternary64>(job); }
-VLA_KERNEL(linear_int8_128, 128, 2, LinearInt8Job) { multiply<Bytes128>(job); }
-VLA_KERNEL(linear_int8_64, 128, 4, LinearInt8Job) { multiply<Bytes64>(job); }
+VLA_EARLY_KERNEL(linear_ternary_128, 128, 2, LinearInt8Job) { multiply<Ternary128>(job); }
+VLA_EARLY_KERNEL(linear_ternary_64, 128, 4, LinearInt8Job) { multiply<Ternary64>(job); }
+VLA_EARLY_KERNEL(linear_int8_128, 128, 2, LinearInt8Job) { multiply<Bytes128>(job); }
+VLA_EARLY_KERNEL(linear_int8_64, 128, 4, LinearInt8Job) { multiply<Bytes64>(job); }
 VLA_KERNEL(linear_ternary_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::ternary>(job); }
 VLA_KERNEL(linear_int8_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::int8>(job); }
 

@@ -7,12 +7,14 @@ namespace {
 
 constexpr int kWarps = 8, kThreads = kWarps * kLanes, kStripRows = 64, kTilesM = kStripRows / 16;
 
-/// A block has kColumns columns of up to 64 rows. Its warps have kTilesN * 8 of the columns each, and take the depth's
-/// steps in turn with those that have the same columns.
-template <int kTilesN_, int kWarpsN_>
+/// A block has kColumns columns of sums of up to 64 rows, half of them the gate's where there is one. Its warps have
+/// kTilesN * 8 of the columns each, and take the depth's steps in turn with those that have the same columns.
+template <int kTilesN_, int kWarpsN_, bool kGated_>
 struct Strip {
   static constexpr int kTilesN = kTilesN_, kWarpsN = kWarpsN_, kWarpsK = kWarps / kWarpsN;
+  static constexpr bool kGated = kGated_;
   static constexpr int kColumns = kTilesN * 8 * kWarpsN;
+  static constexpr int kColumnsY = kGated ? kColumns / 2 : kColumns;
   static constexpr int kRowBytes = (kColumns + 8) * 4;  // of sums in shared memory, padded against bank conflicts
 };
 
@@ -23,20 +25,21 @@ class Operands {
  public:
   /// Of a block's rows and columns those of a warp, from column of_warp of the block on.
   VLA_DEVICE Operands(const LinearBf16Job& job, int row0, int column0, int of_warp)
-      : x_(static_cast<const std::byte*>(job.x) + row0 * job.x_stride * 2),
-        weight_(reinterpret_cast<const std::byte*>(job.weight) + column0 * job.weight_stride * 2),
-        n_chunk_(job.depth / 8) {
+      : x_(static_cast<const std::byte*>(job.x) + row0 * job.x_stride * 2), n_chunk_(job.depth / 8) {
     const int lane = thread_index() % kLanes;
     // Rows and columns behind the last read that one; their sums are not stored.
-    const auto place = [&](int first, int of, int n, std::int64_t stride) {
-      const int last = n - 1 - first;
-      return static_cast<unsigned>((of + lane / 4 < last ? of + lane / 4 : last) * stride * 2);
-    };
+    const auto nearest = [](int i, int n) { return i < n ? i : n - 1; };
 #pragma unroll
-    for (int r = 0; r < 2 * kTilesM; ++r) x_place_[r] = place(row0, r * 8, job.n_row, job.x_stride);
+    for (int r = 0; r < 2 * kTilesM; ++r)
+      x_place_[r] = static_cast<unsigned>((nearest(row0 + r * 8 + lane / 4, job.n_row) - row0) * job.x_stride * 2);
 #pragma unroll
-    for (int n = 0; n < S::kTilesN; ++n)
-      weight_place_[n] = place(column0, of_warp + n * 8, job.n_column, job.weight_stride);
+    for (int n = 0; n < S::kTilesN; ++n) {
+      const int column = of_warp + n * 8;
+      const bool is_gate = S::kGated && column < S::kColumnsY;
+      const int of = column0 + (S::kGated && !is_gate ? column - S::kColumnsY : column) + lane / 4;
+      weight_[n] = reinterpret_cast<const std::byte*>(is_gate ? job.gate_weight : job.weight) +
+                   nearest(of, job.n_column) * job.weight_stride * 2;
+    }
   }
 
   struct Step {
@@ -60,8 +63,7 @@ class Operands {
     const int chunk = chunk_of(step);
 #pragma unroll
     for (int n = 0; n < S::kTilesN; ++n)
-      to.weight[n] = chunk < n_chunk_ ? *reinterpret_cast<const uint4*>(weight_ + weight_place_[n] + chunk * 16)
-                                      : uint4{0, 0, 0, 0};
+      to.weight[n] = chunk < n_chunk_ ? *reinterpret_cast<const uint4*>(weight_[n] + chunk * 16) : uint4{0, 0, 0, 0};
   }
   VLA_DEVICE void load_x(Step& to, int step) const {
     const int chunk = chunk_of(step) < n_chunk_ ? chunk_of(step) : 0;
@@ -72,49 +74,59 @@ class Operands {
  private:
   static VLA_DEVICE int chunk_of(int step) { return step * (kBf16Depth / 8) + thread_index() % 4; }
 
-  const std::byte *x_, *weight_;
-  unsigned x_place_[2 * kTilesM], weight_place_[S::kTilesN];
+  const std::byte *x_, *weight_[S::kTilesN];
+  unsigned x_place_[2 * kTilesM];
   int n_chunk_;
 };
 
 /// Adds the sums of warps that share columns, in their order, and stores pairs of y.
 template <class S>
 VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
-  constexpr int kPairs = S::kColumns / 2, kOf = kStripRows * S::kRowBytes, kEach = kStripRows * kPairs / kThreads;
+  constexpr int kPairs = S::kColumnsY / 2, kOf = kStripRows * S::kRowBytes, kEach = kStripRows * kPairs / kThreads;
   constexpr int kApart = kThreads / kPairs;  // rows between those of a thread
-  const int number = thread_index() / kPairs, column = thread_index() % kPairs * 2;
-  // Where a transaction reads two rows, they are two apart, in different banks.
+  const int number = thread_index() / kPairs, of_block = thread_index() % kPairs * 2, column = column0 + of_block;
+  // Where a transaction reads two rows or four, they are in different banks.
   const int first_row = kPairs == 8 ? (number & ~3) + number % 2 * 2 + number / 2 % 2 : number;
-  const auto valid = [&](int i) {
-    return row0 + first_row + i * kApart < job.n_row && column0 + column < job.n_column;
+  const auto valid = [&](int row) { return row0 + row < job.n_row && column < job.n_column; };
+  const auto add = [&](int row, int at) {
+    float2 sum = {0, 0};
+#pragma unroll
+    for (int w = 0; w < S::kWarpsK; ++w) {
+      const auto pair = dev::read<float2>(dev::shared_memory() + w * kOf + row * S::kRowBytes + at * 4);
+      sum.x += pair.x, sum.y += pair.y;
+    }
+    return sum;
   };
   PairEnds ends[kEach];
 #pragma unroll
   for (int i = 0; i < kEach; ++i)
-    if (job.n_split == 1 && valid(i))
-      ends[i] = load_ends(job.end, row0 + first_row + i * kApart, column0 + column, job.n_column);
+    if (job.n_split == 1 && valid(first_row + i * kApart))
+      ends[i] = load_ends(job.end, row0 + first_row + i * kApart, column, job.n_column);
   __syncthreads();  // sums of all warps are there
 #pragma unroll
   for (int i = 0; i < kEach; ++i) {
     const int row = first_row + i * kApart;
-    float2 sum = {0, 0};
-#pragma unroll
-    for (int w = 0; w < S::kWarpsK; ++w) {
-      const auto pair = dev::read<float2>(dev::shared_memory() + w * kOf + row * S::kRowBytes + column * 4);
-      sum.x += pair.x, sum.y += pair.y;
+    const float2 gate = S::kGated ? add(row, of_block) : float2{0, 0};
+    const float2 sum = add(row, S::kColumns - S::kColumnsY + of_block);
+    if (!valid(row)) continue;
+    if (job.n_split > 1) {
+      const bool has_second = column + 1 < job.n_column;
+      if (S::kGated) store_partial(job, gate.x, gate.y, row0 + row, column, has_second);
+      store_partial(job, sum.x, sum.y, row0 + row, job.n_sum() - job.n_column + column, has_second);
+      continue;
     }
-    if (!valid(i)) continue;
-    if (job.n_split == 1)
-      finish_pair(job.end, ends[i], sum.x, sum.y, row0 + row, column0 + column);
-    else
-      store_pair(job, sum.x, sum.y, row0 + row, column0 + column);
+    if (S::kGated) {
+      ends[i].gate = gate, ends[i].has_gate = true;
+      add_gate_bias(job, ends[i], column);
+    }
+    finish_pair(job.end, ends[i], sum.x, sum.y, row0 + row, column);
   }
 }
 
 template <class S>
 VLA_DEVICE void multiply_strip(const LinearBf16Job& job) {
   const int warp = thread_index() / kLanes, lane = thread_index() % kLanes;
-  const int row0 = static_cast<int>(blockIdx.y) * kStripRows, column0 = static_cast<int>(blockIdx.x) * S::kColumns;
+  const int row0 = static_cast<int>(blockIdx.y) * kStripRows, column0 = static_cast<int>(blockIdx.x) * S::kColumnsY;
   const int of_warp = warp % S::kWarpsN * S::kTilesN * 8, of_k = warp / S::kWarpsN;
   const Share share(job);
   const Operands<S> operands(job, row0, column0, of_warp);
@@ -136,6 +148,7 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job) {
     }
   }
 
+  dev::let_next_begin();
   std::byte* room = dev::shared_memory() + of_k * kStripRows * S::kRowBytes;
 #pragma unroll
   for (int m = 0; m < kTilesM; ++m)
@@ -150,12 +163,15 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job) {
 
 }  // namespace
 
-using Strip16 = Strip<2, 1>;
-using Strip32 = Strip<4, 1>;
-using Strip64 = Strip<4, 2>;
-
-VLA_EARLY_KERNEL(linear_strip_16, 256, 1, LinearBf16Job) { multiply_strip<Strip16>(job); }
-VLA_EARLY_KERNEL(linear_strip_32, 256, 1, LinearBf16Job) { multiply_strip<Strip32>(job); }
-VLA_EARLY_KERNEL(linear_strip_64, 256, 1, LinearBf16Job) { multiply_strip<Strip64>(job); }
+#define VLA_STRIP(width, tiles, warps)                                                                               \
+  VLA_EARLY_KERNEL(linear_strip_##width, 256, 1, LinearBf16Job) { multiply_strip<Strip<tiles, warps, false>>(job); } \
+  VLA_EARLY_KERNEL(linear_strip_##width##_gated, 256, 1, LinearBf16Job) {                                            \
+    multiply_strip<Strip<tiles, warps, true>>(job);                                                                  \
+  }
+VLA_STRIP(16, 2, 1)
+VLA_STRIP(32, 4, 1)
+VLA_STRIP(64, 4, 2)
+VLA_STRIP(128, 4, 4)
+#undef VLA_STRIP
 
 }  // namespace vla::cuda

@@ -7,12 +7,30 @@
 
 namespace vla::cuda {
 
+/// Stores two adjacent sums of a share of the depth, from column `at` of a row of them on.
+VLA_DEVICE void store_partial(const LinearBf16Job& job, float first, float second, int row, int at, bool has_second) {
+  float* to = job.partial + (static_cast<std::int64_t>(blockIdx.z) * job.n_row + row) * job.n_sum() + at;
+  if (has_second && job.n_sum() % 2 == 0 && at % 2 == 0) {
+    *reinterpret_cast<float2*>(to) = float2{first, second};
+  } else {
+    to[0] = first;
+    if (has_second) to[1] = second;
+  }
+}
+
 /// Stores two adjacent sums: the sums themselves if the depth is split, else y.
 VLA_DEVICE void store_pair(const LinearBf16Job& job, float first, float second, int row, int column) {
   if (job.n_split == 1) return finish_pair(job.end, first, second, row, column, job.n_column);
-  float* to = job.partial + (static_cast<std::int64_t>(blockIdx.z) * job.n_row + row) * job.n_column + column;
-  to[0] = first;
-  if (column + 1 < job.n_column) to[1] = second;
+  store_partial(job, first, second, row, column, column + 1 < job.n_column);
+}
+
+constexpr int kMostSplits = 8;  // that are added at once
+
+/// Adds the gate's bias to two sums of it.
+VLA_DEVICE void add_gate_bias(const LinearBf16Job& job, PairEnds& ends, int column) {
+  if (job.gate_bias == nullptr) return;
+  ends.gate.x = dev::add(ends.gate.x, job.gate_bias[column]);
+  if (ends.has_second) ends.gate.y = dev::add(ends.gate.y, job.gate_bias[column + 1]);
 }
 
 /// The steps of the depth that block z of a split computes.

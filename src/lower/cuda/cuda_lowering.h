@@ -20,7 +20,7 @@ struct HeadOp {
 
 struct CudaOp : Step {
   AnyOp<HeadOp> op;
-  ValueId gate = kNone;     // of a gated product, what its first matrix makes
+  ValueId gate = kNone;     // of a gated product, what its first matrix makes; none where one kernel multiplies both
   int n_split = 1;          // shares of the depth, or of keys, of blocks of their own
   ValueId partial = kNone;  // what those leave
 };
@@ -54,13 +54,14 @@ void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 
 /// How blocks of a product cut rows: in 128, in 64, or few rows bound by reading the matrix; strips are of so many
 /// columns of up to 64 rows. And how many shares of the depth have blocks of their own.
-enum class ProductShape { few, strip16, strip32, strip64, rows64, rows128 };
+enum class ProductShape { few, strip16, strip32, strip64, strip128, rows64, rows128 };
 /// Columns of a strip; 0 for other shapes.
 constexpr std::int64_t strip_width(ProductShape shape) {
-  return shape == ProductShape::strip16   ? 16
-         : shape == ProductShape::strip32 ? 32
-         : shape == ProductShape::strip64 ? 64
-                                          : 0;
+  return shape == ProductShape::strip16    ? 16
+         : shape == ProductShape::strip32  ? 32
+         : shape == ProductShape::strip64  ? 64
+         : shape == ProductShape::strip128 ? 128
+                                           : 0;
 }
 struct ProductCut {
   ProductShape shape;

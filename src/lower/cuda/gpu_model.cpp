@@ -64,7 +64,7 @@ constexpr GpuModel kModels[] = {
 // Assumptions, never measured: issue slots that a quarter of an SM fills where nothing else holds it up; the time of
 // the smallest kernel from its first block to its last, in cycles; how long memory takes to answer.
 // What an SM reads from the second-level cache in a cycle.
-constexpr double kSmBytes = 56;
+constexpr double kSmBytes = 22;
 constexpr double kIssue = 0.75, kKernelCycles = 4000, kMemoryLatency = 0.8 * kMicro;
 
 /// The main loop of a kernel on tensor cores, whose blocks have a warp or two for each quarter of an SM. The counts are
@@ -149,7 +149,8 @@ class Costs {
       const MatrixKind kind = l.matrix(*node).kind;
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
       const bool has_codes = kind == MatrixKind::ternary || kind == MatrixKind::int8;
-      const ProductShape shape = cut_product(kind, rows, columns, weight.shape[0], l.n_sm).shape;
+      const bool is_one = linear.gated && op.gate == kNone;
+      const ProductShape shape = cut_product(kind, rows, is_one ? 2 * columns : columns, weight.shape[0], l.n_sm).shape;
       const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
       if (kind == MatrixKind::f32) {  // rows and columns behind the last are multiplied as well

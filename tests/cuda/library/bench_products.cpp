@@ -114,6 +114,7 @@ class Bench {
                                         {"strip 16", Bf16Shape::strip16},
                                         {"strip 32", Bf16Shape::strip32},
                                         {"strip 64", Bf16Shape::strip64},
+                                        {"strip 128", Bf16Shape::strip128},
                                         {"64", Bf16Shape::rows64},
                                         {"128", Bf16Shape::rows128}}) {
         if (shape == Bf16Shape::few && size.n_row > 4 * kBf16FewRows) continue;

@@ -19,6 +19,8 @@ cuda::Bf16Shape bf16_shape(ProductShape shape) {
       return cuda::Bf16Shape::strip32;
     case ProductShape::strip64:
       return cuda::Bf16Shape::strip64;
+    case ProductShape::strip128:
+      return cuda::Bf16Shape::strip128;
     case ProductShape::rows64:
       return cuda::Bf16Shape::rows64;
     case ProductShape::rows128:
@@ -32,11 +34,12 @@ cuda::Int8Shape int8_shape(ProductShape shape) {
                                          : cuda::Int8Shape::rows128;
 }
 
+/// gate: of a gated product the matrix that the same kernel multiplies, or null.
 void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const CudaWeight& matrix, const Param& weight,
-                 const cuda::Epilogue& end, Calls& calls) {
+                 const cuda::Epilogue& end, const op::Linear* gate, Calls& calls) {
   const Value& x = l.value(of);
   const int rows = narrow(rows_of(x.shape)), columns = narrow(weight.shape[1]), depth = narrow(x.shape[0]);
-  const ProductShape shape = cut_product(matrix.kind, rows, columns, depth, l.n_sm).shape;
+  const ProductShape shape = cut_product(matrix.kind, rows, gate ? 2 * columns : columns, depth, l.n_sm).shape;
   switch (matrix.kind) {
     case MatrixKind::f32: {
       const cuda::LinearF32Job job = {.x = l.at(of),
@@ -59,7 +62,9 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .depth = depth,
                                        .n_split = op.n_split,
                                        .partial = l.at(op.partial),
-                                       .end = end};
+                                       .end = end,
+                                       .gate_weight = gate ? l.param<std::uint16_t>(gate->weight) : nullptr,
+                                       .gate_bias = gate ? l.param(gate->bias) : nullptr};
       calls.push_back(call(cuda::linear_bf16(bf16_shape(shape), job), job));
       if (job.n_split > 1) calls.push_back(call(cuda::finish_bf16_partial(job), job));
       return;
@@ -95,7 +100,8 @@ Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const LinearOp& 
     if (product.rule != op::Rule::floats && matrix.kind != MatrixKind::ternary)
       return Error{Code::unsupported, product.weight->name, "a ternary matrix", dtype_name(matrix.encoding.type),
                    "use --kernels ggml"};
-    const bool is_gate = linear.gated && i == 0;
+    const bool is_gate = linear.gated && i == 0, is_one = linear.gated && op.gate == kNone;
+    if (is_gate && is_one) continue;
     const ValueId to = is_gate ? op.gate : op.writes[0];
     cuda::Epilogue end = {};
     end.bias = l.param(product.bias), end.y = l.at(to);
@@ -105,7 +111,8 @@ Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const LinearOp& 
       end.activation = linear.activation, end.gate = l.at(op.gate), end.ends_in_relu = linear.ends_in_relu;
       end.factor = l.at(linear.factor), end.residual = l.at(linear.residual);
     }
-    add_product(l, op, linear.x, matrix, *product.weight, end, calls);
+    const op::Linear* gate = is_one ? linear.linears[0]->as<op::Linear>() : nullptr;
+    add_product(l, op, linear.x, matrix, *product.weight, end, gate, calls);
   }
   return calls;
 }
