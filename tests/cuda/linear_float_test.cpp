@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <doctest/doctest.h>
 
+#include <memory>
+
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/kernels/linear_f32.h"
 #include "cuda/machine.h"
@@ -124,6 +126,31 @@ TEST_CASE(
     }
   }
   CHECK(counts.bank_conflicts == 0);
+}
+
+TEST_CASE("several products in one launch of strips are those of launches of their own") {
+  constexpr int kRows = 50, kDepth = 200, kColumns[] = {70, 33, 128};
+  Numbers numbers;
+  const std::int64_t stride = round_up(kDepth, 8);
+  const Device<std::uint16_t> x(bf16_rows(numbers.floats(kRows * kDepth), kDepth, stride));
+  for (unsigned width : {16U, 32U, 64U}) {
+    std::vector<std::unique_ptr<Device<std::uint16_t>>> weights;
+    std::vector<std::unique_ptr<Device<float>>> together, alone;
+    Several<LinearBf16Job> jobs = {};
+    for (const int n : kColumns) {
+      const auto size = static_cast<std::size_t>(kRows * n);
+      weights.push_back(std::make_unique<Device<std::uint16_t>>(bf16_rows(numbers.floats(n * kDepth), kDepth, stride)));
+      together.push_back(std::make_unique<Device<float>>(size)), alone.push_back(std::make_unique<Device<float>>(size));
+      Epilogue end = {};
+      end.y = alone.back()->get(), end.y_stride = n;
+      LinearBf16Job job = {x.get(), weights.back()->get(), stride, stride, kRows, n, kDepth, 1, nullptr, end, {}, {}};
+      launch(linear_strip(width, job), job);
+      job.end.y = together.back()->get();
+      jobs.job[jobs.n++] = job;
+    }
+    launch(linear_strips(width, jobs), jobs);
+    for (std::size_t i = 0; i < alone.size(); ++i) CHECK(together[i]->host() == alone[i]->host());
+  }
 }
 
 TEST_CASE("strips multiply by a gate's matrix too") {

@@ -162,6 +162,10 @@ TEST_CASE("heads are normed and turned, into rows of another order") {
                                1e-6f,
                                is_bf16};
           launch(head_rows(job), job);
+          const Device<float> first(expected.size()), third(expected.size());  // and beside others in one launch
+          Several<HeadJob> jobs = {{job, job, job}, {}, 3};
+          jobs.job[0].y = first.get(), jobs.job[0].n_batch = 1, jobs.job[2].y = third.get();
+          launch(several_head_rows(jobs), jobs);
           std::vector<float> found = host();
           for (std::size_t i = 0; i < found.size(); ++i)  // what pads a row is left as it is
             if (static_cast<int>(i) % padded >= d) {

@@ -7,6 +7,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "cuda/kernels/launch.h"
+
 #ifdef __CUDACC__
 
 #define VLA_DEVICE __device__ __forceinline__
@@ -147,6 +149,14 @@ VLA_DEVICE float power_of_two(float x) {
 namespace vla::cuda {
 
 constexpr int kLanes = 32;
+
+/// Calls run(job, block of the job) for the job that has this block.
+template <class Job, class Run>
+VLA_DEVICE void run_one(const Several<Job>& jobs, Run run) {
+  int i = 0;
+  while (i + 1 < jobs.n && blockIdx.x >= jobs.end[i]) ++i;
+  run(jobs.job[i], static_cast<int>(i == 0 ? blockIdx.x : blockIdx.x - jobs.end[i - 1]));
+}
 
 VLA_DEVICE int thread_index() { return static_cast<int>(threadIdx.x); }
 VLA_DEVICE float from_bf16(std::uint16_t bits) { return dev::float_of(static_cast<int>(bits) << 16); }

@@ -31,6 +31,15 @@ constexpr unsigned kMaxShared = 99 << 10;
 /// Most blocks of a grid in y and z.
 constexpr unsigned kMaxGridYZ = 65535;
 
+/// Up to so many jobs of one kernel in one launch; blocks of a job end, in x, where the next one's begin.
+constexpr int kMostJobs = 3;
+template <class Job>
+struct Several {
+  Job job[kMostJobs];
+  unsigned end[kMostJobs];
+  int n;
+};
+
 constexpr unsigned blocks(std::int64_t n, std::int64_t size) { return static_cast<unsigned>((n + size - 1) / size); }
 constexpr std::int64_t round_up(std::int64_t n, std::int64_t unit) { return (n + unit - 1) / unit * unit; }
 

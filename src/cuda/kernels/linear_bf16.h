@@ -61,6 +61,16 @@ inline Launch linear_strip(unsigned width, const LinearBf16Job& job) {
           256,
           n_sum * 64 * (width + 8) * 4};
 }
+/// Several products in strips of the same width, rows and depth, without gates and splits.
+inline Launch linear_strips(unsigned width, Several<LinearBf16Job>& jobs) {
+  unsigned n_block = 0;
+  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = n_block += blocks(jobs.job[i].n_column, width);
+  Launch launch = linear_strip(width, jobs.job[0]);
+  launch.kernel = width == 16 ? "linear_strips_16" : width == 32 ? "linear_strips_32" : "linear_strips_64";
+  launch.grid.x = n_block;
+  return launch;
+}
+
 inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
   const auto splits = static_cast<unsigned>(job.n_split);
   if (shape == Bf16Shape::few)

@@ -124,9 +124,9 @@ VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
 }
 
 template <class S>
-VLA_DEVICE void multiply_strip(const LinearBf16Job& job) {
+VLA_DEVICE void multiply_strip(const LinearBf16Job& job, int block) {
   const int warp = thread_index() / kLanes, lane = thread_index() % kLanes;
-  const int row0 = static_cast<int>(blockIdx.y) * kStripRows, column0 = static_cast<int>(blockIdx.x) * S::kColumnsY;
+  const int row0 = static_cast<int>(blockIdx.y) * kStripRows, column0 = block * S::kColumnsY;
   const int of_warp = warp % S::kWarpsN * S::kTilesN * 8, of_k = warp / S::kWarpsN;
   const Share share(job);
   const Operands<S> operands(job, row0, column0, of_warp);
@@ -163,15 +163,26 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job) {
 
 }  // namespace
 
-#define VLA_STRIP(width, tiles, warps)                                                                               \
-  VLA_EARLY_KERNEL(linear_strip_##width, 256, 1, LinearBf16Job) { multiply_strip<Strip<tiles, warps, false>>(job); } \
-  VLA_EARLY_KERNEL(linear_strip_##width##_gated, 256, 1, LinearBf16Job) {                                            \
-    multiply_strip<Strip<tiles, warps, true>>(job);                                                                  \
+#define VLA_STRIP(name, ...)                                               \
+  VLA_EARLY_KERNEL(linear_strip_##name, 256, 1, LinearBf16Job) {           \
+    multiply_strip<Strip<__VA_ARGS__>>(job, static_cast<int>(blockIdx.x)); \
   }
-VLA_STRIP(16, 2, 1)
-VLA_STRIP(32, 4, 1)
-VLA_STRIP(64, 4, 2)
-VLA_STRIP(128, 4, 4)
+#define VLA_STRIPS(name, ...)                                                                                  \
+  VLA_EARLY_KERNEL(linear_strips_##name, 256, 1, Several<LinearBf16Job>) {                                     \
+    run_one(job, [](const LinearBf16Job& one, int block) { multiply_strip<Strip<__VA_ARGS__>>(one, block); }); \
+  }
+VLA_STRIP(16, 2, 1, false)
+VLA_STRIP(32, 4, 1, false)
+VLA_STRIP(64, 4, 2, false)
+VLA_STRIP(128, 4, 4, false)
+VLA_STRIP(16_gated, 2, 1, true)
+VLA_STRIP(32_gated, 4, 1, true)
+VLA_STRIP(64_gated, 4, 2, true)
+VLA_STRIP(128_gated, 4, 4, true)
+VLA_STRIPS(16, 2, 1, false)
+VLA_STRIPS(32, 4, 1, false)
+VLA_STRIPS(64, 4, 2, false)
 #undef VLA_STRIP
+#undef VLA_STRIPS
 
 }  // namespace vla::cuda

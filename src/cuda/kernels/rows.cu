@@ -214,9 +214,9 @@ VLA_KERNEL(norm_rows, 256, 4, NormJob) {
 }
 
 /// A warp computes a row of a head; a lane the pairs (i, i + d_head / 2) of every 32nd i.
-VLA_KERNEL(head_rows, 128, 4, HeadJob) {
+VLA_DEVICE void turn_heads(const HeadJob& job, int block) {
   const int lane = thread_index() % kLanes, half = job.d_head / 2;
-  const std::int64_t number = static_cast<std::int64_t>(blockIdx.x) * 4 + thread_index() / kLanes;
+  const std::int64_t number = static_cast<std::int64_t>(block) * 4 + thread_index() / kLanes;
   if (number >= static_cast<std::int64_t>(job.n_head) * job.n_token * job.n_batch) return;  // the whole warp
   const std::int64_t head = number % job.n_head, token = number / job.n_head % job.n_token,
                      batch = number / job.n_head / job.n_token;
@@ -236,6 +236,10 @@ VLA_KERNEL(head_rows, 128, 4, HeadJob) {
     store(job.y, job.is_bf16, to + i, low * cosine - high * sine);
     store(job.y, job.is_bf16, to + i + half, high * cosine + low * sine);
   }
+}
+VLA_KERNEL(head_rows, 128, 4, HeadJob) { turn_heads(job, static_cast<int>(blockIdx.x)); }
+VLA_KERNEL(several_head_rows, 128, 4, Several<HeadJob>) {
+  run_one(job, [](const HeadJob& one, int block) { turn_heads(one, block); });
 }
 
 VLA_KERNEL(lookup_rows, 128, 8, LookupJob) {

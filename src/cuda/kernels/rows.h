@@ -50,6 +50,12 @@ inline Launch head_rows(const HeadJob& job) {
   return {"head_rows", {blocks(static_cast<std::int64_t>(job.n_head) * job.n_token * job.n_batch, 4)}, 128};
 }
 
+inline Launch several_head_rows(Several<HeadJob>& jobs) {
+  unsigned n_block = 0;
+  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = n_block += head_rows(jobs.job[i]).grid.x;
+  return {"several_head_rows", {n_block}, 128};
+}
+
 enum class TableType { f32, f16, bf16 };
 /// Looks up rows of a table. An id out of range gives a row of NaN; ids are checked before.
 struct LookupJob {

@@ -67,6 +67,8 @@ struct ProductCut {
   ProductShape shape;
   int n_split;
 };
+/// The width of strips of several products together whose depth is not split, 16 to 64.
+unsigned widest_strip(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
 ProductCut cut_product(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
 
 /// How blocks cut rows of queries and shares of keys.

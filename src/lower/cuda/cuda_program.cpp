@@ -6,6 +6,7 @@
 #include <cstring>
 
 #include "lower/cuda/emit.h"
+#include "lower/cuda/merge_calls.h"
 
 namespace vla::lower {
 Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_ptr<CudaQueue> queue,
@@ -86,6 +87,7 @@ Result<std::vector<int>> CudaProgram::make_parts(const CudaLowering& l) {
     if (const auto* product = std::get_if<LinearOp>(&op.op))
       for (const Node* node : product->linears) reads_[phase].push_back(node->as<op::Linear>()->weight);
   }
+  for (std::vector<Calls>& phase : phases) merge_calls(phase, l.n_sm);
   VLA_TRY(const std::vector<Groups> groups, find_groups(reads_, l.weights.groups()));
   prepare_ = pieces(cut_phases(std::span(groups).first(n_prepare_), 0), phases);
   run_ = pieces(cut_phases(std::span(groups).subspan(n_prepare_), n_prepare_), phases);

@@ -155,20 +155,26 @@ std::int64_t blocks_of(std::int64_t n_row, std::int64_t n_column, std::int64_t r
   return (n_row + rows - 1) / rows * ((n_column + columns - 1) / columns);
 }
 
-/// The strips, and shares of the depth, that take the shortest time: measured on an H200, an SM reads about 40 bytes a
-/// nanosecond from the second-level cache, and a kernel that adds shares takes 2 us, beside the traffic of its sums.
-ProductCut cut_in_strips(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
+/// Microseconds of strips: measured on an H200, an SM reads about 40 bytes a nanosecond from the second-level cache,
+/// and a kernel that adds shares takes 2 us, beside the traffic of its sums.
+double strip_us(std::int64_t width, int n_split, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
+                int n_sm) {
   constexpr double kOfSm = 40e3, kOfAll = 3e6, kFinish = 2;  // bytes and microseconds
+  const std::int64_t n_block = blocks_of(n_row, n_column, 64, width) * n_split;
+  const std::int64_t of_block = (std::min<std::int64_t>(n_row, 64) + width) * depth * 2 / n_split;
+  const double us = static_cast<double>((n_block + n_sm - 1) / n_sm * of_block) / kOfSm;
+  return n_split == 1 ? us : us + kFinish + static_cast<double>(2 * 4 * n_row * n_column * n_split) / kOfAll;
+}
+
+/// The strips, and shares of the depth, that take the shortest time.
+ProductCut cut_in_strips(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
   ProductCut best = {ProductShape::strip16, 1};
   double least = std::numeric_limits<double>::max();
   for (const ProductShape shape :
        {ProductShape::strip16, ProductShape::strip32, ProductShape::strip64, ProductShape::strip128})
     for (const int n_split : {1, 2, 4, 8}) {
-      const std::int64_t width = strip_width(shape), n_block = blocks_of(n_row, n_column, 64, width) * n_split;
       if (n_split > 1 && depth / n_split < 8 * cuda::kBf16Depth) break;
-      const std::int64_t of_block = (std::min<std::int64_t>(n_row, 64) + width) * depth * 2 / n_split;
-      double us = static_cast<double>((n_block + n_sm - 1) / n_sm * of_block) / kOfSm;
-      if (n_split > 1) us += kFinish + static_cast<double>(2 * 4 * n_row * n_column * n_split) / kOfAll;
+      const double us = strip_us(strip_width(shape), n_split, n_row, n_column, depth, n_sm);
       if (us < least) least = us, best = {shape, n_split};
     }
   return best;
@@ -176,10 +182,14 @@ ProductCut cut_in_strips(std::int64_t n_row, std::int64_t n_column, std::int64_t
 
 }  // namespace
 
+unsigned widest_strip(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
+  const auto us = [&](unsigned width) { return strip_us(width, 1, n_row, n_column, depth, n_sm); };
+  return std::min({16U, 32U, 64U}, [&](unsigned a, unsigned b) { return us(a) < us(b); });
+}
+
 ProductCut cut_product(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
   const bool is_bf16 = kind == MatrixKind::bf16, is_few = n_row <= (is_bf16 ? cuda::kBf16FewRows : 4);
-  if (is_bf16 && !is_few && n_row <= kMostStripRows && depth % 8 == 0)
-    return cut_in_strips(n_row, n_column, depth, n_sm);
+  if (is_bf16 && is_of_strips(n_row, depth)) return cut_in_strips(n_row, n_column, depth, n_sm);
   const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
   const ProductShape shape = is_few                          ? ProductShape::few
                              : n_row > 64 && n_large >= n_sm ? ProductShape::rows128
