@@ -166,6 +166,8 @@ def main():
     with torch.no_grad() if MODES[args.mode] else torch.inference_mode():
         run = lambda: model.sample_actions(*arguments, noise=noise)  # noqa: E731
         reference = run().float()
+        if args.mode != "eager":  # what the network makes on the CPU and copies, which no capture allows, is made on the device
+            torch.set_default_device(device)
         if MODES[args.mode]:
             compile_parts(model, MODES[args.mode])
         times, answer = measure(run, args.mode, args.rounds, wait)
