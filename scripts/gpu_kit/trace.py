@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the time of an act goes, kernel by kernel: one JSON object on the last line.
+"""Where the time of an act goes, kernel by kernel: a JSON object a line for each family.
 
-    python trace.py VLA FAMILY OUT
+    python trace.py VLA FAMILY[,FAMILY,...] OUT
 
 Acts of random weights at the published size run in this process, back to back, then once under PyTorch's profiler (CUPTI), which sees
 every kernel of the process, those of a graph one by one. It makes graphs somewhat slower: times of kernels are true, gaps between them
@@ -10,7 +10,6 @@ are upper bounds. OUT/kernels.jsonl gets every kernel: begin and duration in mic
 
 import argparse
 import collections
-import contextlib
 import json
 import os
 import statistics
@@ -20,26 +19,28 @@ import time
 from pathlib import Path
 
 
-@contextlib.contextmanager
-def random_bundle(vla, family):
-    """The bundle of vla bench, a file in memory that others may open while bench waits for a line before its first round."""
-    command = [vla, "bench", "--arch", family, "--size", "full", "--device", "cuda", "--runs", "1", "--warmup", "0", "--paced", "--json"]
-    pipe = subprocess.PIPE
-    bench = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
-    try:
+class RandomBundle:
+    """The bundle of vla bench, a file in memory that others may open while bench waits for a line before its first round. It is being made
+    from the beginning, beside others."""
+
+    def __init__(self, vla, family):
+        command = [vla, "bench", "--arch", family, "--size", "full", "--device", "cuda", "--runs", "1", "--warmup", "0", "--paced", "--json"]
+        pipe = subprocess.PIPE
+        self.bench = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+
+    def path(self):
         said = []
-        for line in bench.stderr:
+        for line in self.bench.stderr:
             said.append(line)
             if "solver steps" in line:  # all is loaded
-                break
-        else:
-            raise RuntimeError("".join(said[-3:]))
-        threading.Thread(target=bench.stderr.read, daemon=True).start()
-        files = Path(f"/proc/{bench.pid}/fd").iterdir()
-        yield next(str(file) for file in files if "random bundle" in os.readlink(file))
-    finally:
-        bench.kill()
-        bench.wait()
+                threading.Thread(target=self.bench.stderr.read, daemon=True).start()
+                files = Path(f"/proc/{self.bench.pid}/fd").iterdir()
+                return next(str(file) for file in files if "random bundle" in os.readlink(file))
+        raise RuntimeError("".join(said[-3:]))
+
+    def close(self):
+        self.bench.kill()
+        self.bench.wait()
 
 
 def observation(spec):
@@ -81,16 +82,17 @@ def summary(kernels):
     return {"n": len(kernels), "busy_ms": busy / 1e3, "span_ms": span / 1e3, "gap_us": (span - busy) / len(kernels), "kernels": sorted(rows, key=lambda row: -row["ms"])}
 
 
-def main(vla, family, out):
+def trace(bundle, family, out):
+    """What acts take, and every kernel of one."""
     import vla_cpp
 
-    with random_bundle(vla, family) as bundle, vla_cpp.Policy(bundle, device="cuda") as policy:
+    with vla_cpp.Policy(bundle.path(), device="cuda") as policy:
         seen, walls = observation(policy.spec), []
         for _ in range(30):
             start = time.perf_counter()
             policy.act(**seen)
             walls.append(1e3 * (time.perf_counter() - start))
-        found = {"first_act_ms": walls[0], "act_ms": statistics.median(walls[3:]), "least_act_ms": min(walls[3:])}
+        found = {"family": family, "first_act_ms": walls[0], "act_ms": statistics.median(walls[3:]), "least_act_ms": min(walls[3:])}
         kernels = traced(lambda: policy.act(**seen), out)
     if kernels:
         found.update(summary(kernels))
@@ -98,11 +100,22 @@ def main(vla, family, out):
         with open(out / "kernels.jsonl", "a", encoding="utf-8") as file:
             file.write(json.dumps({"family": family, "kernels": lines}) + "\n")
     print(json.dumps(found), flush=True)
+
+
+def main(vla, families, out):
+    bundles = {family: RandomBundle(vla, family) for family in families.split(",")}
+    try:
+        for family, bundle in bundles.items():
+            trace(bundle, family, out)
+            bundle.close()
+    finally:
+        for bundle in bundles.values():
+            bundle.close()
     os._exit(0)  # PyTorch's profiler and our library, both with libraries of their own, do not always part in peace
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, kind in (("vla", str), ("family", str), ("out", Path)):
+    for name, kind in (("vla", str), ("families", str), ("out", Path)):
         parser.add_argument(name, type=kind)
     main(**vars(parser.parse_args()))

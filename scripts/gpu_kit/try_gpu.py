@@ -222,17 +222,19 @@ def predicted(visit, family):
 
 
 def families(visit):
-    traces = has_torch(visit)
     for family in visit.families:
         found = visit.result["families"].setdefault(family, {})
         found["predicted"] = predicted(visit, family)
         found["stored"] = bench(visit, f"{family}, as stored", family, ["--device", "cuda"], 150)
         if family != "bitvla":  # its products are of int8 already
             found["int8"] = bench(visit, f"{family}, int8", family, ["--device", "cuda", "--kernels", "int8"], 150)
-        if traces:
-            traced = visit.step(f"{family}, kernel by kernel", [visit.options.torch, KIT / "trace.py", VLA, family, visit.out], 150, PYTHONPATH=str(KIT / "python"), VLA_LIBRARY=str(KIT / "bin/libvla.so.1"))
-            found["traced"] = traced and last_json(traced)
         visit.save()
+    if has_torch(visit):
+        command = [visit.options.torch, KIT / "trace.py", VLA, ",".join(visit.families), visit.out]
+        out = visit.step("kernel by kernel", command, 60 * len(visit.families), PYTHONPATH=str(KIT / "python"), VLA_LIBRARY=str(KIT / "bin/libvla.so.1"))
+        for traced in map(json.loads, (out or "").splitlines()):
+            visit.result["families"][traced.pop("family")]["traced"] = traced
+    visit.save()
 
 
 def torch(visit):
