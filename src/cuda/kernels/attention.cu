@@ -424,6 +424,7 @@ VLA_DEVICE void attend_alone(const AttentionJob& job) {
     keys.fetch(first, share.last, stages + stage * 2 * S::kTile);
     values.fetch(first, share.last, stages + (stage * 2 + 1) * S::kTile);
   };
+  dev::wait_for_earlier();
   clear_columns<S>(job.d_head, S::kRows + 4 * S::kKeys, q);
   fetch_queries<S>(job, unit, static_cast<int>(blockIdx.x) * S::kRows, q);
   if (share.first < share.last) fetch(share.first, 0);
@@ -447,6 +448,7 @@ VLA_DEVICE void attend_alone(const AttentionJob& job) {
     warp.add_values_alone(k + S::kTile);
     __syncthreads();  // all threads have read the stage that is overwritten next
   }
+  dev::let_next_begin();
   dev::wait_copies<0>();
   warp.finish(nullptr);
 }
@@ -461,6 +463,7 @@ VLA_DEVICE void attend_shared(const AttentionJob& job) {
   const Share share(job);
   Reader<S, &AttentionJob::Segment::k> keys(job, unit);
   Reader<S, &AttentionJob::Segment::v> values(job, unit);
+  dev::wait_for_earlier();
   clear_columns<S>(job.d_head, S::kRows + 2 * S::kKeys, q);
   fetch_queries<S>(job, unit, static_cast<int>(blockIdx.x) * S::kRows, q);
   if (share.first < share.last) keys.fetch(share.first, share.last, k);
@@ -496,6 +499,7 @@ VLA_DEVICE void attend_shared(const AttentionJob& job) {
     __syncthreads();  // values and weights are visible to all threads
     warp.add_values_shared(weights, v, share.last - first);
   }
+  dev::let_next_begin();
   dev::wait_copies<0>();
   warp.finish(room);
 }
@@ -511,15 +515,15 @@ VLA_DEVICE void attend_bf16(const AttentionJob& job) {
 }  // namespace
 
 // In the order of kAttentionShapes.
-VLA_KERNEL(attention_bf16_64, 128, 3, AttentionJob) { attend_bf16<0>(job); }
-VLA_KERNEL(attention_bf16_64_32, 256, 2, AttentionJob) { attend_bf16<1>(job); }
-VLA_KERNEL(attention_bf16_64_16, 256, 2, AttentionJob) { attend_bf16<2>(job); }
-VLA_KERNEL(attention_bf16_80, 128, 2, AttentionJob) { attend_bf16<3>(job); }
-VLA_KERNEL(attention_bf16_128, 128, 2, AttentionJob) { attend_bf16<4>(job); }
-VLA_KERNEL(attention_bf16_128_32, 256, 2, AttentionJob) { attend_bf16<5>(job); }
-VLA_KERNEL(attention_bf16_128_16, 256, 2, AttentionJob) { attend_bf16<6>(job); }
-VLA_KERNEL(attention_bf16_256, 256, 1, AttentionJob) { attend_bf16<7>(job); }
-VLA_KERNEL(attention_bf16_256_32, 256, 2, AttentionJob) { attend_bf16<8>(job); }
+VLA_EARLY_KERNEL(attention_bf16_64, 128, 3, AttentionJob) { attend_bf16<0>(job); }
+VLA_EARLY_KERNEL(attention_bf16_64_32, 256, 2, AttentionJob) { attend_bf16<1>(job); }
+VLA_EARLY_KERNEL(attention_bf16_64_16, 256, 2, AttentionJob) { attend_bf16<2>(job); }
+VLA_EARLY_KERNEL(attention_bf16_80, 128, 2, AttentionJob) { attend_bf16<3>(job); }
+VLA_EARLY_KERNEL(attention_bf16_128, 128, 2, AttentionJob) { attend_bf16<4>(job); }
+VLA_EARLY_KERNEL(attention_bf16_128_32, 256, 2, AttentionJob) { attend_bf16<5>(job); }
+VLA_EARLY_KERNEL(attention_bf16_128_16, 256, 2, AttentionJob) { attend_bf16<6>(job); }
+VLA_EARLY_KERNEL(attention_bf16_256, 256, 1, AttentionJob) { attend_bf16<7>(job); }
+VLA_EARLY_KERNEL(attention_bf16_256_32, 256, 2, AttentionJob) { attend_bf16<8>(job); }
 
 /// A warp computes one row, a block eight. A lane has one key while scores are computed, then every 32nd element of y.
 VLA_KERNEL(attention_f32, 256, 2, AttentionJob) {
