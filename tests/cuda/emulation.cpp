@@ -3,16 +3,19 @@
 #include "cuda/emulation.h"
 
 #include <algorithm>
+#include <list>
 #include <map>
 #include <memory>
 #include <random>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "cuda/device_memory.h"
 #include "cuda/fault.h"
 #include "cuda/fiber.h"
 #include "cuda/fragments.h"
+#include "cuda/wgmma.h"
 
 namespace vla::test::cuda {
 namespace {
@@ -26,9 +29,15 @@ struct Thread {
   Fiber fiber;
   int number = 0;
 };
+/// Sums of wgmma, and where each lane has them.
+struct Sums : WgmmaSums {
+  std::uint32_t* lanes[kWarp];
+};
 struct Warp {
   Meeting* lanes[kWarp] = {};
   int n_here = 0;
+  Wgmma wgmma = {};
+  std::list<Sums> sums = {};  // in flight
 };
 /// The block that runs.
 struct Block {
@@ -74,6 +83,7 @@ void thread_main() {
   self.fiber.arrived();
   try {
     block.entry->run(block.job);
+    block.warp().wgmma.end();
   } catch (const Fault& problem) {
     if (block.fault.empty()) block.fault = problem.what();
   }
@@ -86,10 +96,12 @@ void run_block(int n_thread, std::size_t shared) {
   const auto n = static_cast<std::size_t>(n_thread);
   while (block.threads.size() < n) block.threads.push_back(std::make_unique<Thread>());
   block.threads.resize(n);
-  block.warps.assign(n / kWarp, {});
+  block.warps.clear();
+  block.warps.resize(n / kWarp);
   block.ready.clear(), block.at_barrier.clear(), block.fault.clear();
   block.n_done = 0;
   block.shared.begin(shared, n_thread);
+  for (std::size_t i = 0; i < block.warps.size(); ++i) block.warps[i].wgmma.begin(block.shared, static_cast<int>(i));
   std::vector<Thread*> all;
   for (std::size_t i = 0; i < n; ++i) {
     block.threads[i]->number = static_cast<int>(i);
@@ -98,7 +110,11 @@ void run_block(int n_thread, std::size_t shared) {
   }
   release(all);
   go_on(block.main);
-  if (block.fault.empty()) return;
+  if (block.fault.empty()) {
+    std::vector<const Wgmma*> warps;
+    for (const Warp& warp : block.warps) warps.push_back(&warp.wgmma);
+    return check_warpgroups(warps);
+  }
   throw Fault(std::string(block.entry->name) + ", block " + std::to_string(blockIdx.x) + "," +
               std::to_string(blockIdx.y) + "," + std::to_string(blockIdx.z) + ", thread " +
               std::to_string(threadIdx.x) + ": " + block.fault);
@@ -155,7 +171,29 @@ void copy_async(std::byte* to, const void* from, std::size_t size) {
 void commit_copies() { block.shared.commit(block.self->number); }
 void wait_copies(std::size_t n_left) { block.shared.wait(n_left, block.self->number); }
 
+unsigned shared_address(const std::byte* p) { return static_cast<unsigned>(block.shared.offset(p)); }
+void fence_async_proxy() { block.shared.fence_async(block.self->number); }
+
 namespace {
+
+/// Takes the lanes' sums over, which hold garbage until they are given back.
+Sums& sums_of(Warp& warp, Meeting* const* lanes) {
+  for (Sums& sums : warp.sums)
+    if (sums.lanes[0] == lanes[0]->to) return sums;
+  Sums& made = warp.sums.emplace_back();
+  made.of.resize(static_cast<std::size_t>(lanes[0]->product->n / 2));
+  for (std::size_t l = 0; l < kWarp; ++l) {
+    made.lanes[l] = lanes[l]->to;
+    for (std::size_t i = 0; i < made.of.size(); ++i) made.of[i][l] = std::exchange(made.lanes[l][i], ~0U);
+  }
+  return made;
+}
+void give_back(Warp& warp) {
+  for (const Sums& sums : warp.sums)
+    for (std::size_t l = 0; l < kWarp && sums.n_product == 0; ++l)
+      for (std::size_t i = 0; i < sums.of.size(); ++i) sums.lanes[l][i] = sums.of[i][l];
+  std::erase_if(warp.sums, [](const Sums& sums) { return sums.n_product == 0; });
+}
 
 /// Registers of all lanes, one after the other.
 template <int kCount>
@@ -168,6 +206,7 @@ struct Registers {
 };
 
 void compute(Meeting* const* lanes, int warp) {
+  Warp& of = block.warps[static_cast<std::size_t>(warp)];
   Lanes to[4], sum[4];
   const auto results = [&] {
     for (int i = 0; i < 4; ++i)
@@ -195,6 +234,17 @@ void compute(Meeting* const* lanes, int warp) {
       (lanes[0]->kind == Meeting::kS8 ? mma_s8 : mma_bf16)(to, a.of, b.of, sum);
       return results();
     }
+    case Meeting::kWgmma:
+      for (int l = 1; l < kWarp; ++l)
+        if (*lanes[l]->product != *lanes[0]->product) fault("lanes of a warp issue different products");
+      return of.wgmma.issue(*lanes[0]->product, sums_of(of, lanes));
+    case Meeting::kWgmmaFence:
+      return of.wgmma.fence();
+    case Meeting::kWgmmaCommit:
+      return of.wgmma.commit();
+    case Meeting::kWgmmaWait:
+      of.wgmma.wait(lanes[0]->n_left);
+      return give_back(of);
   }
 }
 
@@ -209,7 +259,7 @@ void meet(Meeting& mine) {
   if (++warp.n_here == kWarp) {
     Meeting* lanes[kWarp];
     std::copy(warp.lanes, warp.lanes + kWarp, lanes);
-    warp = {};
+    std::fill(warp.lanes, warp.lanes + kWarp, nullptr), warp.n_here = 0;
     compute(lanes, first / kWarp);
     std::vector<Thread*> all;
     for (int l = 0; l < kWarp; ++l) all.push_back(block.threads[static_cast<std::size_t>(first + l)].get());

@@ -74,14 +74,29 @@ void check_shared(const std::byte* p, std::size_t size, bool writes);
 void copy_async(std::byte* to, const void* from, std::size_t size);
 void commit_copies();
 void wait_copies(std::size_t n_left);
+unsigned shared_address(const std::byte* p);
+void fence_async_proxy();
+
+/// A product of a warpgroup: sums[64][n] (+)= a[64][depth] * b[n][depth].
+struct WgmmaProduct {
+  enum Kind { bf16, s8 } kind = bf16;
+  int n = 0;
+  std::uint64_t a = 0, b = 0;  // matrix descriptors
+  bool adds = false;
+
+  int depth() const { return kind == bf16 ? 16 : 32; }
+  friend bool operator==(const WgmmaProduct&, const WgmmaProduct&) = default;
+};
 
 /// What lanes that meet hold out: registers to read, and where results go.
 struct Meeting {
-  enum Kind { kSync, kShuffle, kMatrices, kTransposed, kS8, kBf16 } kind;
+  enum Kind { kSync, kShuffle, kMatrices, kTransposed, kS8, kBf16, kWgmma, kWgmmaFence, kWgmmaCommit, kWgmmaWait } kind;
   const std::uint32_t *a = nullptr, *b = nullptr;
   std::uint32_t* to = nullptr;  // of products also the sums so far
   const std::byte* row = nullptr;
   int lane = 0;  // whose value a shuffle takes
+  const WgmmaProduct* product = nullptr;
+  std::size_t n_left = 0;  // groups of products that a wait leaves
 };
 void meet(Meeting& mine);
 int lane_index();
@@ -96,7 +111,7 @@ inline void __syncwarp() {
 
 namespace vla::cuda::dev {
 
-using test::cuda::commit_copies, test::cuda::shared_memory;
+using test::cuda::commit_copies, test::cuda::shared_memory, test::cuda::shared_address, test::cuda::fence_async_proxy;
 inline void wait_for_earlier() {}
 inline void let_next_begin() {}
 template <class T>
@@ -138,6 +153,35 @@ inline void multiply_bf16(float (&sum)[4], const unsigned (&a)[4], unsigned b0, 
   test::cuda::Meeting mine = {test::cuda::Meeting::kBf16, a, b, bits};
   test::cuda::meet(mine);
   std::memcpy(sum, bits, sizeof(bits));
+}
+template <class T>
+void wgmma(test::cuda::WgmmaProduct::Kind kind, int n, T* sum, std::uint64_t a, std::uint64_t b, bool adds) {
+  const test::cuda::WgmmaProduct product = {kind, n, a, b, adds};
+  test::cuda::Meeting mine = {test::cuda::Meeting::kWgmma};
+  mine.to = reinterpret_cast<std::uint32_t*>(sum), mine.product = &product;
+  test::cuda::meet(mine);
+}
+template <int kN>
+void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
+  wgmma(test::cuda::WgmmaProduct::bf16, kN, sum, a, b, adds);
+}
+inline void wgmma_fence() {
+  test::cuda::Meeting mine = {test::cuda::Meeting::kWgmmaFence};
+  test::cuda::meet(mine);
+}
+inline void wgmma_commit() {
+  test::cuda::Meeting mine = {test::cuda::Meeting::kWgmmaCommit};
+  test::cuda::meet(mine);
+}
+template <int kLeft>
+void wgmma_wait() {
+  test::cuda::Meeting mine = {test::cuda::Meeting::kWgmmaWait};
+  mine.n_left = kLeft;
+  test::cuda::meet(mine);
+}
+template <class T, int kCount>
+void wgmma_wait_all(T (&)[kCount]) {
+  wgmma_wait<0>();
 }
 inline int dot4(unsigned a, unsigned b, int sum) {
   for (int i = 0; i < 32; i += 8) sum += static_cast<std::int8_t>(a >> i) * static_cast<std::int8_t>(b >> i);

@@ -340,7 +340,7 @@ struct Calls {
     if (captures()) return kCaptureUnsupported;
     Function* function = find(state.functions, handle);
     if (function == nullptr) return kInvalidHandle;
-    if (attribute != 8 || value < 0 || static_cast<unsigned>(value) > vla::cuda::kMaxShared) return kInvalidValue;
+    if (attribute != 8 || value < 0 || static_cast<unsigned>(value) > vla::cuda::kHopperShared) return kInvalidValue;
     function->max_shared = static_cast<unsigned>(value);
     return 0;
   }

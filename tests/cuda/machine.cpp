@@ -44,6 +44,7 @@ const std::vector<PtxModule>& modules() {
 }  // namespace
 
 bool runs_ptx() { return !modules().empty(); }
+bool is_hopper() { return true; }
 double bf16_sum_error(int) { return 0; }
 std::vector<std::string> modules_of_tests() { return runs_ptx() ? texts() : std::vector<std::string>{kHostModule}; }
 
@@ -54,7 +55,8 @@ void launch(const vla::cuda::Launch& how, const void* job, std::size_t job_size)
   if (grid.x == 0 || grid.y == 0 || grid.z == 0) refuse("a grid without blocks");
   if (grid.y > vla::cuda::kMaxGridYZ || grid.z > vla::cuda::kMaxGridYZ)
     refuse("more blocks in y or z than a grid may have");
-  if (how.shared > vla::cuda::kMaxShared) refuse("more shared memory than every device has");
+  if (how.shared > (name.starts_with("hopper_") ? vla::cuda::kHopperShared : vla::cuda::kMaxShared))
+    refuse("more shared memory than every device has");
   device_memory().begin_launch();
   const Extent extent = {grid.x, grid.y, grid.z};
   for (const PtxModule& module : modules())

@@ -25,6 +25,9 @@ void launch(const vla::cuda::Launch& how, const Job& job) {
 /// Whether kernels run as PTX: where VLA_CUDA_PTX names files, FILE:FILE.
 bool runs_ptx();
 
+/// Whether kernels for Hopper alone run, too.
+bool is_hopper();
+
 /// How far a bf16 product's sum over a depth may be from the exact one, beside the rounding of the result: nothing on
 /// the emulated machine, which adds exact products in float32. As a share of the largest result.
 double bf16_sum_error(int depth);

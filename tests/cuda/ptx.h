@@ -35,6 +35,9 @@ struct PtxInstruction {
   bool sign = false, wide_address = false, wide_value = false;  // registers of 8 bytes
   mutable DeviceMemory::Allocation* hint = nullptr;             // where the last access went
   mutable std::uint64_t hint_time = 0;
+  std::vector<std::uint32_t> sums;  // of wgmma
+  WgmmaProduct product;
+  bool is_move = false;
   std::string text;
 };
 
@@ -83,6 +86,8 @@ struct PtxOperation {
   PtxInstruction::Kind kind = PtxInstruction::kPlain;
 };
 const PtxOperation* find_operation(const std::string& name);
+/// The product of a wgmma, and what runs it; null for others.
+void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, const PtxInstruction&);
 /// Loads (ld) and stores (st) of param, shared and global; null for others.
 void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&);
 

@@ -74,6 +74,7 @@ class Reader {
     };
     for (PtxInstruction& one : kernel_.code) {
       for (int i = 0; i < one.n_operand; ++i) one.operand[i] = shift(one.operand[i]);
+      for (std::uint32_t& place : one.sums) place = shift(place);
       if (one.has_guard) one.guard = shift(one.guard);
     }
     for (PtxKernel::Special& special : kernel_.specials) special.place = shift(special.place);
@@ -217,6 +218,8 @@ class Reader {
       return;
     }
     if (starts_with(name, "ld.") || starts_with(name, "st.")) return decode_access(one, name, operands);
+    if (starts_with(name, "wgmma.mma_async.")) return decode_wgmma(one, name, operands);
+    one.is_move = name == "mov.f32" || name == "mov.b32" || name == "mov.u32";
     const PtxOperation* operation = find_operation(name);
     if (starts_with(name, "cvt.") && operation != nullptr && operation->operands[1] == 'd')
       if (const auto found = registers_.find(operands.at(1)); found != registers_.end() && found->second.type == 'q')
@@ -235,6 +238,20 @@ class Reader {
         one.operand[one.n_operand++] = operand(operands[i], types[i]);
       }
     }
+  }
+
+  /// Sums, descriptors of a and b, whether it adds; of floats also that nothing is negated or transposed.
+  void decode_wgmma(PtxInstruction& one, const std::string& name, const std::vector<std::string>& operands) {
+    one.run = find_wgmma(name, one.product), one.kind = PtxInstruction::kWarp;
+    if (one.run == nullptr) throw Fault("unknown instruction " + name);
+    const auto n_sum = static_cast<std::size_t>(one.product.n / 2);
+    std::vector<std::string> tail = {"1", "1", "0", "0"};
+    if (one.product.kind == WgmmaProduct::s8) tail.clear();
+    if (operands.size() != n_sum + 3 + tail.size()) throw Fault("another number of operands");
+    if (!std::equal(tail.begin(), tail.end(), operands.end() - static_cast<std::ptrdiff_t>(tail.size())))
+      throw Fault("wgmma that negates or transposes");
+    for (std::size_t i = 0; i < n_sum; ++i) one.sums.push_back(operand(operands[i], 'd'));
+    for (std::size_t i = 0; i < 3; ++i) one.operand[one.n_operand++] = operand(operands[n_sum + i], "qqp"[i]);
   }
 
   void decode_access(PtxInstruction& one, const std::string& name, std::vector<std::string> operands) {
@@ -287,6 +304,7 @@ PtxModule::PtxModule(const std::string& text) {
   PtxKernel* kernel = nullptr;
   std::string statement;
   bool in_head = false;
+  int depth = 0;  // braces inside of a kernel
   const auto report = [&](const Fault& problem) {
     return Fault("PTX of " + (kernel ? kernel->name : "a module") + ": " + problem.what());
   };
@@ -313,6 +331,10 @@ PtxModule::PtxModule(const std::string& text) {
         if (const std::size_t at = statement.find(".maxntid"); at != std::string::npos)
           kernel->max_thread = std::atoi(statement.c_str() + at + 8);
         statement.clear();
+      } else if (c == '{' && reader && trim(statement).empty()) {  // names inside hide those outside
+        ++depth;
+      } else if (c == '}' && depth > 0 && trim(statement).empty()) {
+        --depth;
       } else if (c == '}' && kernel != nullptr && trim(statement).empty()) {
         reader->finish();
         reader.reset(), kernel = nullptr, statement.clear();

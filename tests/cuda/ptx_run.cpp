@@ -5,12 +5,15 @@
 #include <cfenv>
 #include <cmath>
 #include <cstring>
+#include <list>
+#include <map>
 #include <random>
 #include <unordered_map>
 
 #include "cuda/fault.h"
 #include "cuda/fragments.h"
 #include "cuda/ptx.h"
+#include "cuda/wgmma.h"
 
 namespace vla::test::cuda {
 
@@ -34,6 +37,9 @@ struct WarpState {
   const std::byte* job = nullptr;
   std::size_t job_size = 0;
   SharedMemory* shared = nullptr;
+  Wgmma wgmma;
+  std::list<WgmmaSums> sums;                                    // in flight
+  std::map<u32, std::pair<WgmmaSums*, std::size_t>> in_flight;  // registers of such sums
 
   template <class T>
   T* lanes(u32 place) {
@@ -230,6 +236,50 @@ void shuffle(WarpState& w, const PtxInstruction& i) {
   }
   std::memcpy(w.lanes<u32>(i.operand[0]), to, sizeof(to));
 }
+/// Takes the sums over from registers, unless they are in flight already.
+void wgmma(WarpState& w, const PtxInstruction& i) {
+  WgmmaProduct product = i.product;
+  product.a = w.lanes<u64>(i.operand[0])[0], product.b = w.lanes<u64>(i.operand[1])[0];
+  const u32 adds = w.mask(i.operand[2]);
+  for (int l = 0; l < kWarp; ++l)
+    if (w.lanes<u64>(i.operand[0])[l] != product.a || w.lanes<u64>(i.operand[1])[l] != product.b)
+      fault_at(w, i, l, "lanes of a warp issue different products");
+  if (adds != 0 && adds != kAll) fault_at(w, i, 0, "lanes of a warp issue different products");
+  product.adds = adds != 0;
+  const auto first = w.in_flight.find(i.sums[0]);
+  WgmmaSums* sums = first == w.in_flight.end() ? nullptr : first->second.first;
+  if (sums == nullptr) sums = &w.sums.emplace_back();
+  sums->of.resize(i.sums.size());
+  for (std::size_t r = 0; r < i.sums.size(); ++r) {
+    const auto [at, is_new] = w.in_flight.try_emplace(i.sums[r], sums, r);
+    if (is_new && sums->n_product == 0) std::memcpy(&sums->of[r], w.lanes<u32>(i.sums[r]), sizeof(Lanes));
+    if (at->second != std::pair{sums, r} || (is_new && sums->n_product != 0))
+      fault_at(w, i, 0, "sums of different products");
+  }
+  guarded(w, i, 0, [&] { w.wgmma.issue(product, *sums); });
+}
+void wgmma_wait(WarpState& w, const PtxInstruction& i) {
+  guarded(w, i, 0, [&] { w.wgmma.wait(w.lanes<u32>(i.operand[0])[0]); });
+  for (const auto& [place, sum] : w.in_flight)
+    if (sum.first->n_product == 0) std::memcpy(w.lanes<u32>(place), &sum.first->of[sum.second], sizeof(Lanes));
+  std::erase_if(w.in_flight, [](const auto& one) { return one.second.first->n_product == 0; });
+  std::erase_if(w.sums, [](const WgmmaSums& sums) { return sums.n_product == 0; });
+}
+/// While sums are in flight, other instructions than wgmma may only rename their registers. Whether that was done.
+bool renames(WarpState& w, const PtxInstruction& i) {
+  const auto found = i.is_move ? w.in_flight.find(i.operand[1]) : w.in_flight.end();
+  if (i.is_move) w.in_flight.erase(i.operand[0]);
+  if (found != w.in_flight.end()) {
+    if (w.active != kAll) fault_at(w, i, 0, "touches sums of wgmma that it has not waited for");
+    const auto sum = found->second;
+    w.in_flight[i.operand[0]] = sum;
+    return true;
+  }
+  for (int k = 0; k < i.n_operand; ++k)
+    if (w.in_flight.contains(i.operand[k])) fault_at(w, i, 0, "touches sums of wgmma that it has not waited for");
+  return false;
+}
+
 void warp_barrier(WarpState& w, const PtxInstruction&) { w.shared->warp_barrier(w.number); }
 
 float fma_down(float a, float b, float c) {
@@ -349,6 +399,7 @@ const PtxOperation kOperations[] = {
     {"setp.ne.s16", "pdd", COMPARE(u32, (a & 0xffff) != (b & 0xffff))},
     {"setp.eq.b64", "pqq", COMPARE(u64, a == b)},
     {"setp.eq.b32", "pdd", COMPARE(u32, a == b)},
+    {"setp.ne.b32", "pdd", COMPARE(u32, a != b)},
     {"cvt.s64.s32", "qd", ONE(i64, i32, a)},
     {"cvt.s64.s32 of 64 bits", "qq", ONE(i64, i64, static_cast<i32>(a))},
     {"cvt.u64.u32", "qd", ONE(u64, u32, a)},
@@ -395,6 +446,14 @@ const PtxOperation kOperations[] = {
      [](WarpState& w,
         const PtxInstruction&
             i) { each_lane(w.active, [&](int l) { w.shared->wait(w.lanes<u32>(i.operand[0])[l], w.thread(l)); }); }},
+    {"fence.proxy.async.shared::cta", "",
+     [](WarpState& w,
+        const PtxInstruction&) { each_lane(w.active, [&](int l) { w.shared->fence_async(w.thread(l)); }); }},
+    {"wgmma.fence.sync.aligned", "", [](WarpState& w, const PtxInstruction&) { w.wgmma.fence(); },
+     PtxInstruction::kWarp},
+    {"wgmma.commit_group.sync.aligned", "", [](WarpState& w, const PtxInstruction&) { w.wgmma.commit(); },
+     PtxInstruction::kWarp},
+    {"wgmma.wait_group.sync.aligned", "d", wgmma_wait, PtxInstruction::kWarp},
     {"griddepcontrol.launch_dependents", "", [](WarpState&, const PtxInstruction&) {}},
     {"griddepcontrol.wait", "", [](WarpState& w, const PtxInstruction&) { w.early &= ~w.active; }},
     {"bar.sync", "d", nullptr, PtxInstruction::kBarrier},
@@ -417,6 +476,18 @@ const PtxOperation* find_operation(const std::string& name) {
   }();
   const auto found = all.find(name);
   return found == all.end() ? nullptr : &found->second;
+}
+
+void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, const PtxInstruction&) {
+  const std::string_view start = "wgmma.mma_async.sync.aligned.m64n";
+  if (name.compare(0, start.size(), start) != 0) return nullptr;
+  char* end = nullptr;
+  product.n = static_cast<int>(std::strtol(name.c_str() + start.size(), &end, 10));
+  const std::string_view shape = end;
+  if (product.n < 8 || product.n > 256 || product.n % 8 != 0) return nullptr;
+  if (shape != "k16.f32.bf16.bf16" && shape != "k32.s32.s8.s8") return nullptr;
+  product.kind = shape[1] == '1' ? WgmmaProduct::bf16 : WgmmaProduct::s8;
+  return wgmma;
 }
 
 void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&) {
@@ -468,12 +539,13 @@ bool run_warp(WarpState& w, const PtxKernel& kernel) {
     switch (i.kind) {
       case PtxInstruction::kPlain:
         w.active = active;
-        if (active != 0) i.run(w, i);
+        if (active != 0 && (w.in_flight.empty() || !renames(w, i))) i.run(w, i);
         break;
       case PtxInstruction::kBranch:
         jumps = active;
         break;
       case PtxInstruction::kReturn:
+        w.wgmma.end();
         if (w.early & active) throw Fault("ends without having waited for earlier kernels");
         w.live &= ~active;
         break;
@@ -519,6 +591,7 @@ void run_block(const PtxKernel& kernel, Extent grid, BlockIndex at, unsigned n_t
     w.live = kAll, w.waits = 0, w.early = kernel.overlaps ? kAll : 0, w.together = true, w.pc = 0, w.n_done = 0;
     w.number = static_cast<int>(i), w.job = static_cast<const std::byte*>(job), w.job_size = kernel.param_size;
     w.shared = &shared;
+    w.wgmma.begin(shared, w.number), w.in_flight.clear(), w.sums.clear();
     w.registers.resize(kernel.register_bytes);
     std::copy(kernel.constants.begin(), kernel.constants.end(), w.registers.begin());
     for (const PtxKernel::Special& special : kernel.specials) {
@@ -540,11 +613,14 @@ void run_block(const PtxKernel& kernel, Extent grid, BlockIndex at, unsigned n_t
     if (schedule.seed) std::shuffle(order.begin(), order.end(), random);
     std::size_t n_end = 0;
     for (WarpState* w : order) n_end += run_warp(*w, kernel);
-    if (n_end == order.size()) return;
+    if (n_end == order.size()) break;
     if (n_end != 0) throw Fault("some threads end while others wait at a barrier");
     shared.barrier();
     ++counts.barriers;
   }
+  std::vector<const Wgmma*> products;
+  for (const WarpState& w : warps) products.push_back(&w.wgmma);
+  check_warpgroups(products);
 }
 
 }  // namespace

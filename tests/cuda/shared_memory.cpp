@@ -24,7 +24,8 @@ void SharedMemory::begin(std::size_t size, int n_thread) {
   const auto n = static_cast<std::size_t>(n_thread);
   warp_time_.resize(std::max(warp_time_.size(), n / kWarp));
   open_.assign(n, {}), committed_.assign(n, {});
-  ++time_;  // whatever the block before did is over
+  fences_.assign(n, {}), async_done_.assign(n / kWarp, {}), async_readers_.clear();
+  begin_time_ = ++time_;  // whatever the block before did is over
 }
 
 void SharedMemory::check_range(std::size_t offset, std::size_t size) const {
@@ -62,6 +63,7 @@ void SharedMemory::write(std::size_t offset, std::size_t size, int thread) {
     Word& word = words_[i];
     if (!ordered(word.write, thread)) throw Fault("race in shared memory: writes what another thread or a copy writes");
     if (!ordered(word.read, thread)) throw Fault("race in shared memory: writes what another thread reads");
+    if (!async_readers_.empty()) check_async_readers(i, thread);
     word.write = now(thread);
   }
 }
@@ -95,6 +97,43 @@ void SharedMemory::arrive(const Copy& copy, int thread) {
   std::memset(data_ + copy.offset, 0, 16);
   std::memcpy(data_ + copy.offset, copy.from, copy.size);
   for (std::size_t i = copy.offset / 4; i < copy.offset / 4 + 4; ++i) words_[i].write = now(thread);
+}
+
+void SharedMemory::fence_async(int thread) { fences_[static_cast<std::size_t>(thread)].push_back(time_); }
+
+void SharedMemory::async_read(std::size_t offset, std::size_t size, int warp, std::uint32_t group) {
+  check_range(offset, size);
+  const auto of_warp = static_cast<std::size_t>(warp);
+  if (of_warp >= kMostWarps) throw Fault("more warps than a block may have");
+  async_readers_.resize((size_ + 3) / 4);
+  async_done_[of_warp].resize(group + 1, kPending);
+  for (std::size_t i = offset / 4; i < (offset + size) / 4; ++i) {
+    const Event& write = words_[i].write;
+    async_readers_[i][of_warp] = group + 1;
+    if (write.thread == kNobody || write.time < begin_time_) continue;
+    if (write.time == kPending) throw Fault("wgmma reads what an asynchronous copy has not brought");
+    if (!ordered(write, warp * kWarp)) throw Fault("race in shared memory: wgmma reads what another thread writes");
+    const auto& fences = fences_[static_cast<std::size_t>(write.thread)];
+    const bool is_own = write.thread / kWarp == warp;
+    if (fences.size() <= write.n_fence || (!is_own && fences[write.n_fence] >= time_))
+      throw Fault("wgmma reads what no fence.proxy.async has made visible");
+  }
+}
+
+void SharedMemory::async_done(int warp, std::uint32_t group) {
+  auto& done = async_done_[static_cast<std::size_t>(warp)];
+  done.resize(std::max<std::size_t>(done.size(), group + 1), kPending);
+  done[group] = time_;
+}
+
+void SharedMemory::check_async_readers(std::size_t word, int thread) const {
+  for (std::size_t warp = 0; warp < async_done_.size(); ++warp) {
+    const std::uint32_t group = async_readers_[word][warp];
+    if (group == 0) continue;
+    const std::uint64_t done = async_done_[warp][group - 1];
+    const bool is_own = warp == static_cast<std::size_t>(thread / kWarp);
+    if (done == kPending || (!is_own && done >= time_)) throw Fault("race in shared memory: writes what wgmma reads");
+  }
 }
 
 void SharedMemory::count_conflicts(std::span<const std::size_t> offsets, std::size_t width) {

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <deque>
@@ -45,6 +46,13 @@ class SharedMemory {
   void commit(int thread);
   void wait(std::size_t n_left, int thread);
 
+  /// Makes what a thread wrote visible to asynchronous reads, which need a barrier after it besides.
+  void fence_async(int thread);
+  /// A warp's asynchronous read in a group of such, which are numbered from 0 in each block. Nobody may write there
+  /// before the warp has waited for the group, and another warp not before a barrier after that.
+  void async_read(std::size_t offset, std::size_t size, int warp, std::uint32_t group);
+  void async_done(int warp, std::uint32_t group);
+
   /// Counts what lanes wait for each other when they access `width` bytes at each offset: those of one bank, but for
   /// the same word, go one after the other. Up to 128 bytes are one transaction. Lanes with kNone take no part.
   static constexpr std::size_t kNone = ~std::size_t{0};
@@ -54,6 +62,7 @@ class SharedMemory {
   struct Event {
     int thread = -1;  // or, of readers, one of the values below
     std::uint64_t time = 0, warp_time = 0;
+    std::size_t n_fence = 0;  // of that thread before it
   };
   struct Word {
     Event write, read;
@@ -64,11 +73,16 @@ class SharedMemory {
     std::size_t size;
   };
   static constexpr int kNobody = -1, kManyOfWarp = 1 << 20, kMany = 1 << 21;
+  static constexpr std::size_t kMostWarps = 32;
   static constexpr std::uint64_t kPending = ~std::uint64_t{0};
 
   void check_range(std::size_t offset, std::size_t size) const;
   bool ordered(const Event& event, int thread) const;
-  Event now(int thread) const { return {thread, time_, warp_time_[static_cast<std::size_t>(thread / kWarp)]}; }
+  void check_async_readers(std::size_t word, int thread) const;
+  Event now(int thread) const {
+    const auto t = static_cast<std::size_t>(thread);
+    return {thread, time_, warp_time_[t / kWarp], fences_[t].size()};
+  }
   void arrive(const Copy& copy, int thread);
 
   std::vector<std::byte> room_;
@@ -76,6 +90,10 @@ class SharedMemory {
   std::size_t size_ = 0;
   std::vector<Word> words_;
   std::uint64_t time_ = 1;  // barriers of this block and those before it
+  std::uint64_t begin_time_ = 1;
+  std::vector<std::vector<std::uint64_t>> fences_;                    // of each thread: their times
+  std::vector<std::vector<std::uint64_t>> async_done_;                // of each warp and group: its time
+  std::vector<std::array<std::uint32_t, kMostWarps>> async_readers_;  // of each word and warp: the last group, from 1
   std::vector<std::uint64_t> warp_time_;
   std::vector<std::vector<Copy>> open_;                   // of each thread, since its last commit
   std::vector<std::deque<std::vector<Copy>>> committed_;  // the oldest group first

@@ -28,6 +28,8 @@ struct Launch {
 
 /// Largest shared memory of a block on the devices with least: sm_86, sm_89 and sm_120.
 constexpr unsigned kMaxShared = 99 << 10;
+/// The same on Hopper.
+constexpr unsigned kHopperShared = 227 << 10;
 /// Most blocks of a grid in y and z.
 constexpr unsigned kMaxGridYZ = 65535;
 

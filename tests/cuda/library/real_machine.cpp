@@ -90,6 +90,7 @@ void DeviceMemory::release(void* p) {
 }
 
 bool runs_ptx() { return true; }
+bool is_hopper() { return machine().gpu->is_hopper(); }
 
 /// Tensor cores multiply exactly, but add in groups, of 8 products on Ampere and more on Hopper: a group's products are
 /// shifted to the largest exponent among them and the sum so far, and what lies a bit or two below the last place of

@@ -1,0 +1,123 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "cuda/kernels/device.h"
+
+/// Products of a warpgroup (four warps in a row, the first a multiple of four), for files that are compiled for sm_90a
+/// alone. For the host's compiler tests/cuda/emulation.h has the same functions. Source: PTX ISA 9.0, "Asynchronous
+/// Warpgroup Level Matrix Multiply-Accumulate Instructions".
+#ifdef __CUDACC__
+
+namespace vla::cuda::dev {
+
+/// Makes this thread's writes to shared memory, also by copies that it has waited for, visible to wgmma. A barrier must
+/// follow before another thread's wgmma reads them.
+VLA_DEVICE void fence_async_proxy() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
+
+/// Comes before the first wgmma, and before those after sums were read or written by other instructions.
+VLA_DEVICE void wgmma_fence() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }
+VLA_DEVICE void wgmma_commit() { asm volatile("wgmma.commit_group.sync.aligned;" ::: "memory"); }
+/// Waits until all but the latest kLeft groups of this warpgroup have ended: then their operands may be overwritten.
+template <int kLeft>
+VLA_DEVICE void wgmma_wait() {
+  asm volatile("wgmma.wait_group.sync.aligned %0;" ::"n"(kLeft) : "memory");
+}
+/// Waits for all groups: then sums may be read.
+template <class T, int kCount>
+VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
+  wgmma_wait<0>();
+#pragma unroll
+  for (int i = 0; i < kCount; ++i) {  // no read of a sum moves before the wait
+    if constexpr (sizeof(T) == 4 && T(0.5f) == T(0))
+      asm volatile("" : "+r"(sum[i])::"memory");
+    else
+      asm volatile("" : "+f"(sum[i])::"memory");
+  }
+}
+
+// clang-format off
+// Registers %0 to %(n - 1), and sums as operands of these.
+#define VLA_R8 "%0, %1, %2, %3, %4, %5, %6, %7"
+#define VLA_R16 VLA_R8 ", %8, %9, %10, %11, %12, %13, %14, %15"
+#define VLA_R24 VLA_R16 ", %16, %17, %18, %19, %20, %21, %22, %23"
+#define VLA_R32 VLA_R24 ", %24, %25, %26, %27, %28, %29, %30, %31"
+#define VLA_R40 VLA_R32 ", %32, %33, %34, %35, %36, %37, %38, %39"
+#define VLA_R48 VLA_R40 ", %40, %41, %42, %43, %44, %45, %46, %47"
+#define VLA_R56 VLA_R48 ", %48, %49, %50, %51, %52, %53, %54, %55"
+#define VLA_R64 VLA_R56 ", %56, %57, %58, %59, %60, %61, %62, %63"
+#define VLA_R72 VLA_R64 ", %64, %65, %66, %67, %68, %69, %70, %71"
+#define VLA_R80 VLA_R72 ", %72, %73, %74, %75, %76, %77, %78, %79"
+#define VLA_R88 VLA_R80 ", %80, %81, %82, %83, %84, %85, %86, %87"
+#define VLA_R96 VLA_R88 ", %88, %89, %90, %91, %92, %93, %94, %95"
+#define VLA_R104 VLA_R96 ", %96, %97, %98, %99, %100, %101, %102, %103"
+#define VLA_R112 VLA_R104 ", %104, %105, %106, %107, %108, %109, %110, %111"
+#define VLA_R120 VLA_R112 ", %112, %113, %114, %115, %116, %117, %118, %119"
+#define VLA_R128 VLA_R120 ", %120, %121, %122, %123, %124, %125, %126, %127"
+#define VLA_SUMS(c, i) c(sum[i]), c(sum[i + 1]), c(sum[i + 2]), c(sum[i + 3]), c(sum[i + 4]), c(sum[i + 5]), c(sum[i + 6]), c(sum[i + 7])
+#define VLA_S8(c) VLA_SUMS(c, 0)
+#define VLA_S16(c) VLA_S8(c), VLA_SUMS(c, 8)
+#define VLA_S24(c) VLA_S16(c), VLA_SUMS(c, 16)
+#define VLA_S32(c) VLA_S24(c), VLA_SUMS(c, 24)
+#define VLA_S40(c) VLA_S32(c), VLA_SUMS(c, 32)
+#define VLA_S48(c) VLA_S40(c), VLA_SUMS(c, 40)
+#define VLA_S56(c) VLA_S48(c), VLA_SUMS(c, 48)
+#define VLA_S64(c) VLA_S56(c), VLA_SUMS(c, 56)
+#define VLA_S72(c) VLA_S64(c), VLA_SUMS(c, 64)
+#define VLA_S80(c) VLA_S72(c), VLA_SUMS(c, 72)
+#define VLA_S88(c) VLA_S80(c), VLA_SUMS(c, 80)
+#define VLA_S96(c) VLA_S88(c), VLA_SUMS(c, 88)
+#define VLA_S104(c) VLA_S96(c), VLA_SUMS(c, 96)
+#define VLA_S112(c) VLA_S104(c), VLA_SUMS(c, 104)
+#define VLA_S120(c) VLA_S112(c), VLA_SUMS(c, 112)
+#define VLA_S128(c) VLA_S120(c), VLA_SUMS(c, 120)
+// half: n / 2, the number of sums of a thread; pa, pb, pp: the numbers of the operands behind them.
+#define VLA_WGMMA(n, half, pb, pp, shape, tail, c)                                                     \
+  if constexpr (kN == n)                                                                               \
+    asm volatile("{\n.reg .pred adds;\nsetp.ne.b32 adds, %" #pp ", 0;\n"                               \
+                 "wgmma.mma_async.sync.aligned.m64n" #n shape " {" VLA_R##half "}, %" #half ", %" #pb  \
+                 ", adds" tail ";\n}"                                                                  \
+                 : VLA_S##half(c) : "l"(a), "l"(b), "r"(static_cast<int>(adds)) : "memory")
+#define VLA_WGMMA_OF_ANY_SIZE(shape, tail, c)          \
+  VLA_WGMMA(64, 32, 33, 34, shape, tail, c);           \
+  VLA_WGMMA(80, 40, 41, 42, shape, tail, c);           \
+  VLA_WGMMA(96, 48, 49, 50, shape, tail, c);           \
+  VLA_WGMMA(112, 56, 57, 58, shape, tail, c);          \
+  VLA_WGMMA(128, 64, 65, 66, shape, tail, c);          \
+  VLA_WGMMA(144, 72, 73, 74, shape, tail, c);          \
+  VLA_WGMMA(160, 80, 81, 82, shape, tail, c);          \
+  VLA_WGMMA(176, 88, 89, 90, shape, tail, c);          \
+  VLA_WGMMA(192, 96, 97, 98, shape, tail, c);          \
+  VLA_WGMMA(208, 104, 105, 106, shape, tail, c);       \
+  VLA_WGMMA(224, 112, 113, 114, shape, tail, c);       \
+  VLA_WGMMA(240, 120, 121, 122, shape, tail, c);       \
+  VLA_WGMMA(256, 128, 129, 130, shape, tail, c)
+// clang-format on
+
+/// sum[64, kN] (+)= a[64, 16] * b[kN, 16]^T of bf16 with sums in float32, without the old sums unless it adds.
+/// Descriptors name a and b in shared memory. Of 16 rows of each warp, register 4 j + 2 h + c of lane l is row l / 4 +
+/// 8 h, column 8 j + 2 (l % 4) + c.
+template <int kN>
+VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
+  static_assert(kN % 16 == 0 && kN >= 64 && kN <= 256);
+  VLA_WGMMA_OF_ANY_SIZE("k16.f32.bf16.bf16", ", 1, 1, 0, 0", "+f");
+}
+
+}  // namespace vla::cuda::dev
+
+#endif
+
+namespace vla::cuda {
+
+/// Operands of wgmma are rows of 128 bytes of the depth, eight to 1024 bytes at a multiple of that, with the 16-byte
+/// chunks of a row permuted by its number: swizzling over 128 bytes.
+constexpr int kSwizzledRow = 128, kSwizzledRows = 8;
+VLA_DEVICE int swizzled(int row, int chunk) { return row * kSwizzledRow + (chunk ^ row % kSwizzledRows) * 16; }
+
+/// The matrix descriptor of such rows. To go on by k bytes of the depth, add k / 16.
+VLA_DEVICE std::uint64_t swizzled_descriptor(const std::byte* rows) {
+  constexpr std::uint64_t kSwizzle128 = std::uint64_t{1} << 62, kStride = kSwizzledRow * kSwizzledRows / 16;
+  return (dev::shared_address(rows) & 0x3ffffU) >> 4 | std::uint64_t{1} << 16 | kStride << 32 | kSwizzle128;
+}
+
+}  // namespace vla::cuda
