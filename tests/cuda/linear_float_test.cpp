@@ -1,13 +1,10 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include <doctest/doctest.h>
-
 #include <memory>
 
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/kernels/linear_f32.h"
-#include "cuda/machine.h"
-#include "cuda/numbers.h"
+#include "cuda/products.h"
 
 using namespace vla;
 using namespace vla::cuda;
@@ -15,15 +12,9 @@ using namespace vla::test::cuda;
 
 namespace {
 
-struct Case {
-  int n_row, depth, n_column, n_split;
-  Activation activation = Activation::none;
-  bool has_bias = false, has_factor = false, has_gate = false, has_residual = false, is_bf16 = false,
-       ends_in_relu = false;
-};
 // Fewer than a tile, and a little more; depths that end within a step and within 16 bytes; every activation and each
 // part of the epilogue.
-constexpr Case kCases[] = {
+constexpr ProductCase kCases[] = {
     {1, 8, 32, 1},
     {7, 40, 33, 1, Activation::relu, true},
     {50, 200, 144, 1, Activation::gelu_tanh, true, false, false, true},
@@ -35,66 +26,13 @@ constexpr Case kCases[] = {
     {65, 48, 66, 1, Activation::none, true, false, false, true, false, true},
 };
 
-struct Operands {
-  Operands(const Case& of, bool rounds_x) : c(of) {
-    Numbers numbers;
-    x = numbers.floats(c.n_row * c.depth);
-    if (rounds_x) x = rounded_to_bf16(x);
-    weight = rounded_to_bf16(numbers.floats(c.n_column * c.depth, 1 / std::sqrt(static_cast<float>(c.depth))));
-    bias = numbers.floats(c.n_column), factor = numbers.floats(c.n_column);
-    gate = numbers.floats(c.n_row * c.n_column), residual = numbers.floats(c.n_row * c.n_column);
-  }
-
-  std::vector<double> expected() const {
-    std::vector<double> y;
-    for (int r = 0; r < c.n_row; ++r)
-      for (int n = 0; n < c.n_column; ++n) {
-        const auto column = static_cast<std::size_t>(n), at = static_cast<std::size_t>(r * c.n_column + n);
-        double sum = c.has_bias ? static_cast<double>(bias[column]) : 0;
-        for (int k = 0; k < c.depth; ++k)
-          sum += static_cast<double>(x[static_cast<std::size_t>(r * c.depth + k)]) *
-                 static_cast<double>(weight[static_cast<std::size_t>(n * c.depth + k)]);
-        sum = c.has_gate ? activated(c.activation, static_cast<double>(gate[at])) * sum : activated(c.activation, sum);
-        if (c.has_factor) sum *= static_cast<double>(factor[column]);
-        if (c.has_residual) sum += static_cast<double>(residual[at]);
-        y.push_back(c.ends_in_relu ? activated(Activation::relu, sum) : sum);
-      }
-    return y;
-  }
-
-  Case c;
-  std::vector<float> x, weight, bias, factor, gate, residual;
-};
-
-/// Launches with the operands' epilogue; `multiply` gets it, and y's rows are two elements longer than they need be.
-template <class Multiply>
-std::vector<float> run(const Operands& of, Multiply multiply) {
-  const Case& c = of.c;
-  const Device<float> bias(of.bias), factor(of.factor), gate(of.gate), residual(of.residual);
-  const std::int64_t stride = c.n_column + 2;
-  const Device<float> y(static_cast<std::size_t>(c.n_row * stride));
-  const Device<std::uint16_t> half(static_cast<std::size_t>(c.n_row * stride));
-  multiply(Epilogue{c.has_bias ? bias.get() : nullptr, c.has_factor ? factor.get() : nullptr,
-                    c.has_gate ? gate.get() : nullptr, c.has_residual ? residual.get() : nullptr,
-                    c.is_bf16 ? static_cast<void*>(half.get()) : y.get(), stride, c.activation, c.is_bf16,
-                    c.ends_in_relu});
-  const std::vector<float> rows = c.is_bf16 ? widened(half.host()) : y.host();
-  std::vector<float> out;
-  for (int r = 0; r < c.n_row; ++r) {
-    const auto first = rows.begin() + r * stride;
-    out.insert(out.end(), first, first + c.n_column);
-    CHECK(std::isnan(first[c.n_column]));  // nothing is written behind a row
-  }
-  return out;
-}
-
 }  // namespace
 
 TEST_CASE(
     "bf16 products of every shape are as near to doubles as sums in float32, or a rounding of y, are; few rows are not "
     "rounded") {
   counts = {};
-  for (const Case& c : kCases) {
+  for (const ProductCase& c : kCases) {
     for (Bf16Shape shape : {Bf16Shape::few, Bf16Shape::strip16, Bf16Shape::strip32, Bf16Shape::strip64,
                             Bf16Shape::strip128, Bf16Shape::rows64, Bf16Shape::rows128}) {
       if (strip_width(shape) > 0 && c.depth % 8 != 0) continue;
@@ -104,7 +42,7 @@ TEST_CASE(
       const std::vector<double> expected = of.expected();
       const std::int64_t stride = round_up(c.depth, 8) + 8;
       in_every_schedule([&] {
-        const std::vector<float> y = run(of, [&](const Epilogue& end) {
+        const std::vector<float> y = run_product(of, [&](const Epilogue& end) {
           const Device<float> few(of.x), partial(static_cast<std::size_t>(c.n_split * c.n_row * c.n_column));
           const Device<std::uint16_t> rounded(bf16_rows(of.x, c.depth, stride)),
               weight(bf16_rows(of.weight, c.depth, stride));
@@ -155,13 +93,13 @@ TEST_CASE("several products in one launch of strips are those of launches of the
 
 TEST_CASE("strips multiply by a gate's matrix too") {
   counts = {};
-  for (Case c : {Case{50, 720, 70, 1, Activation::silu, true, true, false, true, true},
-                 Case{48, 296, 21, 3, Activation::gelu_tanh, true},
-                 Case{9, 64, 130, 2, Activation::none, false, false, false, true}}) {
+  for (ProductCase c : {ProductCase{50, 720, 70, 1, Activation::silu, true, true, false, true, true},
+                        ProductCase{48, 296, 21, 3, Activation::gelu_tanh, true},
+                        ProductCase{9, 64, 130, 2, Activation::none, false, false, false, true}}) {
     const std::int64_t stride = round_up(c.depth, 8) + 8;
     Numbers numbers;
     // What the gate's product is, is the gate of what is expected.
-    Operands gate(Case{c.n_row, c.depth, c.n_column, 1, Activation::none, c.has_bias}, true);
+    Operands gate(ProductCase{c.n_row, c.depth, c.n_column, 1, Activation::none, c.has_bias}, true);
     gate.weight = rounded_to_bf16(numbers.floats(c.n_column * c.depth, 0.1f));
     c.has_gate = true;
     Operands of(c, true);
@@ -172,7 +110,7 @@ TEST_CASE("strips multiply by a gate's matrix too") {
     for (Bf16Shape shape : {Bf16Shape::strip16, Bf16Shape::strip32, Bf16Shape::strip64, Bf16Shape::strip128}) {
       INFO("shape ", static_cast<int>(shape), ", ", c.n_row, " x ", c.depth, " x ", c.n_column);
       in_every_schedule([&] {
-        const std::vector<float> y = run(of, [&](Epilogue end) {
+        const std::vector<float> y = run_product(of, [&](Epilogue end) {
           end.gate = nullptr;
           const Device<float> partial(static_cast<std::size_t>(2 * c.n_split * c.n_row * c.n_column)), bias(gate.bias);
           const Device<std::uint16_t> x(bf16_rows(of.x, c.depth, stride)),
@@ -191,11 +129,11 @@ TEST_CASE("strips multiply by a gate's matrix too") {
 }
 
 TEST_CASE("float32 products are within 2e-6 of doubles") {
-  for (const Case& c : kCases) {
+  for (const ProductCase& c : kCases) {
     const Operands of(c, false);
     INFO(c.n_row, " x ", c.depth, " x ", c.n_column);
     in_every_schedule([&] {
-      const std::vector<float> y = run(of, [&](const Epilogue& end) {
+      const std::vector<float> y = run_product(of, [&](const Epilogue& end) {
         const Device<float> x(of.x), weight(of.weight);
         const LinearF32Job job = {x.get(), weight.get(), c.depth, c.n_row, c.n_column, c.depth, end};
         launch(linear_f32(job), job);

@@ -193,6 +193,108 @@ MISTAKES = {
         "row0 + row < n_row && k0 + k < depth;",
         "row0 + row <= n_row && k0 + k < depth;",
     ),
+    # Products in tiles for Hopper.
+    "no fence before wgmma reads copies": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "    dev::fence_async_proxy();\n",
+        "",
+    ),
+    "fence behind the barrier": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "    dev::fence_async_proxy();\n    __syncthreads();",
+        "    __syncthreads();\n    dev::fence_async_proxy();",
+    ),
+    "no barrier before wgmma": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "    __syncthreads();  // all warpgroups",
+        "    // all warpgroups",
+    ),
+    "wgmma of a stage too early": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "wait_copies<T::kStages - 3>",
+        "wait_copies<T::kStages - 2>",
+    ),
+    "fetches into the stage that wgmma reads": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "next = T::kStages - 2;",
+        "next = T::kStages - 1;",
+    ),
+    "waits for wgmma too late": ("hopper_linear_bf16.cu", "hopper_linear_bf16", "wgmma_wait<1>", "wgmma_wait<2>"),
+    "sums are read before wgmma has ended": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "  dev::wgmma_wait_all(sum);\n",
+        "",
+    ),
+    "no fence of wgmma's registers": ("hopper_linear_bf16.cu", "hopper_linear_bf16", "    dev::wgmma_fence();\n", ""),
+    "only the first warps multiply": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "    dev::wgmma_fence();\n",
+        "    if (thread_index() < 96) dev::wgmma_fence();\n",
+    ),
+    "each part of the first step anew": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "x + 2 * k, i + k > 0",
+        "x + 2 * k, i > 0",
+    ),
+    "a descriptor moves too far": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "w + 2 * k, x + 2 * k",
+        "w + 2 * k, x + k",
+    ),
+    "a descriptor's stride of another swizzling": (
+        "hopper.h",
+        "hopper_linear_bf16",
+        "kStride = kSwizzledRow * kSwizzledRows / 16",
+        "kStride = kSwizzledRow * kSwizzledRows / 32",
+    ),
+    "a descriptor without swizzling": ("hopper.h", "hopper_linear_bf16", "{1} << 62", "{0} << 62"),
+    "rows are not swizzled": ("hopper.h", "hopper_linear_bf16", "(chunk ^ row % kSwizzledRows)", "chunk"),
+    "rows of a tile behind the last": ("hopper_linear_bf16.cu", "hopper_linear_bf16", "i < n_left_ ? size : 0", "size"),
+    "depth of a tile ends too late": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "left < 0 ? 0 : left > 16 ? 16 : left",
+        "left < 0 ? 0 : 16",
+    ),
+    "no barrier before stages become room for y": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "  __syncthreads();  // the stages' memory",
+        "  // the stages' memory",
+    ),
+    "no barrier before y is read": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "  __syncthreads();\n  Finish",
+        "  Finish",
+    ),
+    "rows of y without padding, which is slow": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "(T::kColumns + 4)",
+        "T::kColumns",
+    ),
+    "rows of y behind the last": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "left < T::kRows ? left : T::kRows",
+        "T::kRows",
+    ),
+    "four columns are always there": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "together_ = job.n_column % 4 == 0 &&",
+        "together_ =",
+    ),
     # Attention.
     "values are not transposed": ("device.h", "attention", "x4.trans.shared", "x4.shared"),
     "no barrier before keys are fetched again": (
@@ -328,7 +430,7 @@ MISTAKES = {
     "NaN is not the largest": ("window.cu", "window", "x > most || x != x", "x > most"),
     "an image too far": ("window.cu", "window", "view * job.height * job.width", "view * job.height * job.height"),
 }
-TESTS = {"linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*",
+TESTS = {"linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*",
          "attention": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*", "channel_attention": "*channel_attention_test*"}  # fmt: skip
 
 

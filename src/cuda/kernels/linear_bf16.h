@@ -82,6 +82,37 @@ inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
           128,
           4 * 2 * size * kBf16Depth * 2};
 }
+
+/// Tiles of kernels for Hopper alone (hopper_linear_bf16.cu): columns, a multiple of 64, and rows, a multiple of 16.
+#define VLA_HOPPER_TILES(each)                                                                                       \
+  each(64, 64) each(64, 128) each(128, 64) each(128, 96) each(128, 112) each(128, 128) each(128, 144) each(128, 160) \
+      each(128, 176) each(128, 192) each(128, 208) each(128, 224) each(128, 240) each(128, 256) each(192, 112)       \
+          each(192, 128) each(192, 160) each(192, 192) each(192, 208) each(192, 224) each(192, 240) each(256, 96)    \
+              each(256, 112) each(256, 128) each(256, 160)
+struct HopperTile {
+  const char* kernel;
+  int columns, rows;
+};
+constexpr HopperTile kHopperTiles[] = {
+#define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_bf16_" #columns "x" #rows, columns, rows},
+    VLA_HOPPER_TILES(VLA_HOPPER_TILE)
+#undef VLA_HOPPER_TILE
+};
+constexpr int kHopperDepth = 64;  // step of the depth, and unit of a split
+/// Bytes of a step, and steps that shared memory holds: eight, or what the largest of a block on Hopper has room for.
+constexpr int hopper_stage_bytes(int columns, int rows) { return (columns + rows) * kHopperDepth * 2; }
+constexpr int hopper_stages(int columns, int rows) {
+  const int most = static_cast<int>(kHopperShared) / hopper_stage_bytes(columns, rows);
+  return most < 8 ? most : 8;
+}
+inline Launch hopper_linear_bf16(const HopperTile& tile, const LinearBf16Job& job) {
+  // Blocks side by side read the same columns, so that the matrix comes from memory once.
+  return {tile.kernel,
+          {blocks(job.n_row, tile.rows), blocks(job.n_column, tile.columns), static_cast<unsigned>(job.n_split)},
+          static_cast<unsigned>(tile.columns) * 2,
+          static_cast<unsigned>(hopper_stages(tile.columns, tile.rows) * hopper_stage_bytes(tile.columns, tile.rows))};
+}
+
 inline Launch finish_bf16_partial(const LinearBf16Job& job) {
   return {"linear_bf16_finish", {blocks(job.n_column, 256), static_cast<unsigned>(job.n_row)}, 128};
 }

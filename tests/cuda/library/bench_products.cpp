@@ -126,6 +126,26 @@ class Bench {
         if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
         VLA_CHECK(tell("bf16", size, name, n_split, jobs, launches));
       }
+    if (gpu_->is_hopper() && size.n_row > 32) return run_hopper(size, x, matrices, partial, end);
+    return {};
+  }
+
+  Status run_hopper(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Buffer& partial,
+                    const Epilogue& end) {
+    const std::int64_t stride = round_up(size.depth, 8);
+    for (const HopperTile& tile : kHopperTiles)
+      for (const int n_split : {1, 2, 3, 4, 6, 8}) {
+        const unsigned n_block = blocks(size.n_row, tile.rows) * blocks(size.n_column, tile.columns);
+        if (n_split > 1 && n_block * static_cast<unsigned>(n_split - 1) > 2U * static_cast<unsigned>(gpu_->n_sm()))
+          break;
+        std::vector<LinearBf16Job> jobs;
+        for (const Buffer& matrix : matrices)
+          jobs.push_back({x.as<void>(), matrix.as<std::uint16_t>(), stride, stride, size.n_row, size.n_column,
+                          size.depth, n_split, partial.as<float>(), end});
+        std::vector<Launch> launches = {hopper_linear_bf16(tile, jobs[0])};
+        if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
+        VLA_CHECK(tell("bf16", size, tile.kernel, n_split, jobs, launches));
+      }
     return {};
   }
 

@@ -1,0 +1,54 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/kernels/linear_bf16.h"
+#include "cuda/products.h"
+
+using namespace vla;
+using namespace vla::cuda;
+using namespace vla::test::cuda;
+
+namespace {
+
+// For tiles of up to 192 columns and 256 rows: less than a tile, and more; a depth of more steps than there are stages;
+// no step at all for some splits; columns that four at a time divide, and do not.
+constexpr ProductCase kHopperCases[] = {
+    {5, 40, 33, 1, Activation::relu, true},
+    {260, 72, 200, 1, Activation::silu, true, true, true, true, true},
+    {65, 616, 66, 1, Activation::none, true, false, false, true, false, true},
+    {67, 301, 70, 3, Activation::gelu_erf, true, false, false, true},
+    {96, 96, 136, 3, Activation::gelu_tanh, true, false, false, true, true},
+    {129, 192, 200, 1},
+};
+
+}  // namespace
+
+TEST_CASE("bf16 products in tiles for Hopper are as near to doubles") {
+  if (!is_hopper()) {
+    MESSAGE("skipped: no device of compute capability 9.0");
+    return;
+  }
+  counts = {};
+  for (const ProductCase& c : kHopperCases) {
+    const Operands of(c, true);
+    const std::vector<double> expected = of.expected();
+    const std::int64_t stride = round_up(c.depth, 8) + 8;
+    for (const HopperTile& tile : kHopperTiles) {
+      INFO(tile.kernel, ", ", c.n_row, " x ", c.depth, " x ", c.n_column);
+      in_every_schedule([&] {
+        const std::vector<float> y = run_product(of, [&](const Epilogue& end) {
+          const Device<float> partial(static_cast<std::size_t>(c.n_split * c.n_row * c.n_column));
+          const Device<std::uint16_t> x(bf16_rows(of.x, c.depth, stride)),
+              weight(bf16_rows(of.weight, c.depth, stride));
+          const LinearBf16Job job = {x.get(), weight.get(), stride,
+                                     stride,  c.n_row,      c.n_column,
+                                     c.depth, c.n_split,    c.n_split > 1 ? partial.get() : nullptr,
+                                     end};
+          launch(hopper_linear_bf16(tile, job), job);
+          if (c.n_split > 1) launch(finish_bf16_partial(job), job);
+        });
+        CHECK(error(y, expected) < (c.is_bf16 ? 4e-3 : 1e-6 + bf16_sum_error(c.depth)));
+      });
+    }
+  }
+  CHECK(counts.bank_conflicts == 0);
+}
