@@ -165,6 +165,10 @@ template <int kN>
 void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
   wgmma(test::cuda::WgmmaProduct::bf16, kN, sum, a, b, adds);
 }
+template <int kN>
+void wgmma_s8(int (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
+  wgmma(test::cuda::WgmmaProduct::s8, kN, sum, a, b, adds);
+}
 inline void wgmma_fence() {
   test::cuda::Meeting mine = {test::cuda::Meeting::kWgmmaFence};
   test::cuda::meet(mine);

@@ -6,6 +6,7 @@
 
 #include <array>
 #include <random>
+#include <type_traits>
 
 #include "cuda/machine.h"
 
@@ -22,6 +23,12 @@ struct Case {
 // Fewer rows, columns and depth than a tile, and a little more; odd rows of y; more stages than there is depth.
 constexpr Case kCases[] = {{1, 48, 32, 1},          {3, 100, 80, 1, true},           {129, 144, 131, 1, true, true},
                            {67, 430, 128, 1, true}, {130, 368, 146, 1, false, true}, {33, 700, 97, 3, true, true}};
+
+// For tiles of up to 192 columns and 256 rows: less than a tile, and more; halves of steps; more steps than stages;
+// splits of one step; columns that four at a time divide, and do not.
+constexpr Case kHopperCases[] = {
+    {5, 48, 33, 1},          {260, 100, 200, 1, true, true}, {65, 700, 70, 1, true},
+    {67, 430, 128, 3, true}, {96, 290, 136, 3, false, true}, {130, 1100, 97, 2, true, true}};
 
 class Trial {
  public:
@@ -57,6 +64,15 @@ class Trial {
 
   /// y of the kernel that `shape` names.
   std::vector<float> run(Int8Shape shape) const {
+    return run([&](const LinearInt8Job& job) { return linear_int8(kind_, shape, job); });
+  }
+  std::vector<float> run(const HopperInt8Tile& tile) const {
+    return run([&](const LinearInt8Job& job) { return hopper_linear_int8(tile, job); });
+  }
+
+  template <class Made>
+  requires std::is_invocable_v<Made, const LinearInt8Job&> std::vector<float> run(Made made)
+  const {
     const Device<std::byte> x(x_), packed(packed_);
     const Device<float> scale(scale_), bias(bias_), residual(residual_), y(residual_.size());
     const Device<int> partial(residual_.size() * static_cast<std::size_t>(c_.n_split));
@@ -71,7 +87,7 @@ class Trial {
                Activation::none,
                false,
                false};
-    launch(linear_int8(kind_, shape, job), job);
+    launch(made(job), job);
     if (c_.n_split > 1) launch(finish_int8_partial(job), job);
     return y.host();
   }
@@ -131,6 +147,25 @@ TEST_CASE("int8 products of every shape are equal to whole numbers and single ro
         INFO("kind ", static_cast<int>(kind), ", shape ", static_cast<int>(shape), ", ", c.n_row, " x ", c.d_in, " x ",
              c.d_out);
         in_every_schedule([&] { CHECK(trial.run(shape) == expected); });
+      }
+    }
+  CHECK(counts.bank_conflicts == 0);
+}
+
+TEST_CASE("int8 products in tiles for Hopper are equal to the same bits") {
+  if (!is_hopper()) {
+    MESSAGE("skipped: no device of compute capability 9.0");
+    return;
+  }
+  counts = {};
+  for (CodeKind kind : {CodeKind::ternary, CodeKind::int8})
+    for (const Case& c : kHopperCases) {
+      const Trial trial(kind, c);
+      const std::vector<float> expected = trial.expected();
+      for (const HopperInt8Tile& tile : kHopperInt8Tiles) {
+        if (tile.kind != kind) continue;
+        INFO(tile.kernel, ", ", c.n_row, " x ", c.d_in, " x ", c.d_out);
+        in_every_schedule([&] { CHECK(trial.run(tile) == expected); });
       }
     }
   CHECK(counts.bank_conflicts == 0);

@@ -258,9 +258,14 @@ MISTAKES = {
     ),
     "a descriptor without swizzling": ("hopper.h", "hopper_linear_bf16", "{1} << 62", "{0} << 62"),
     "rows are not swizzled": ("hopper.h", "hopper_linear_bf16", "(chunk ^ row % kSwizzledRows)", "chunk"),
-    "rows of a tile behind the last": ("hopper_linear_bf16.cu", "hopper_linear_bf16", "i < n_left_ ? size : 0", "size"),
+    "rows of a tile behind the last": (
+        "hopper_tile.h",
+        "hopper_linear_bf16",
+        "i < n_left_ ? size : 0",
+        "size",
+    ),
     "depth of a tile ends too late": (
-        "hopper_linear_bf16.cu",
+        "hopper_tile.h",
         "hopper_linear_bf16",
         "left < 0 ? 0 : left > 16 ? 16 : left",
         "left < 0 ? 0 : 16",
@@ -274,26 +279,80 @@ MISTAKES = {
     "no barrier before y is read": (
         "hopper_linear_bf16.cu",
         "hopper_linear_bf16",
-        "  __syncthreads();\n  Finish",
-        "  Finish",
+        "  End::place(sum, shared);\n  __syncthreads();\n",
+        "  End::place(sum, shared);\n",
     ),
     "rows of y without padding, which is slow": (
-        "hopper_linear_bf16.cu",
+        "hopper_tile.h",
         "hopper_linear_bf16",
-        "(T::kColumns + 4)",
-        "T::kColumns",
+        "(kColumns + 4)",
+        "kColumns",
     ),
     "rows of y behind the last": (
-        "hopper_linear_bf16.cu",
+        "hopper_tile.h",
         "hopper_linear_bf16",
-        "left < T::kRows ? left : T::kRows",
-        "T::kRows",
+        "left < kRows ? left : kRows",
+        "kRows",
     ),
     "four columns are always there": (
-        "hopper_linear_bf16.cu",
+        "hopper_tile.h",
         "hopper_linear_bf16",
         "together_ = job.n_column % 4 == 0 &&",
         "together_ =",
+    ),
+    "codes are unpacked before they came": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "dev::wait_copies<T::kStages - 3>();",
+        "dev::wait_copies<T::kStages - 2>();",
+    ),
+    "codes are unpacked to rows that wgmma reads": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "if (i + 1 < n) codes.unpack(packed + stage * kPacked, rows_w + stage_w * T::kBytesW);",
+        "if (i + 1 < n) codes.unpack(packed + stage * kPacked, rows_w + (stage_w + 2) % 3 * T::kBytesW);",
+    ),
+    "the first codes are read too early": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "  dev::wait_copies<T::kStages - 2>();\n  codes.unpack",
+        "  codes.unpack",
+    ),
+    "no fence before wgmma reads unpacked codes": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "    dev::fence_async_proxy();\n",
+        "",
+    ),
+    "unpacked codes are not swizzled": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "swizzled(column, warp() % 2 * 4 + fragment)",
+        "column * kSwizzledRow + (warp() % 2 * 4 + fragment) * 16",
+    ),
+    "fragments of unpacked codes swapped": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "words[k] >> 2 * s &",
+        "words[k] >> 2 * (s ^ 1) &",
+    ),
+    "codes of a tile behind the last": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "const bool valid = is_there_ && tile < n_tile_;",
+        "const bool valid = true;",
+    ),
+    "each share of the depth takes the offset off": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "T::kKind == CodeKind::ternary && z == 0 ?",
+        "T::kKind == CodeKind::ternary ?",
+    ),
+    "scales of other columns": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "job.scale[column + c]",
+        "job.scale[column]",
     ),
     # Attention.
     "values are not transposed": ("device.h", "attention", "x4.trans.shared", "x4.shared"),
@@ -430,7 +489,7 @@ MISTAKES = {
     "NaN is not the largest": ("window.cu", "window", "x > most || x != x", "x > most"),
     "an image too far": ("window.cu", "window", "view * job.height * job.width", "view * job.height * job.height"),
 }
-TESTS = {"linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*",
+TESTS = {"linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*", "hopper_linear_int8": "*linear_int8_test*",
          "attention": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*", "channel_attention": "*channel_attention_test*"}  # fmt: skip
 
 

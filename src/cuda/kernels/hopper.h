@@ -29,7 +29,7 @@ VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
   wgmma_wait<0>();
 #pragma unroll
   for (int i = 0; i < kCount; ++i) {  // no read of a sum moves before the wait
-    if constexpr (sizeof(T) == 4 && T(0.5f) == T(0))
+    if constexpr (T(0.5f) == T(0))
       asm volatile("" : "+r"(sum[i])::"memory");
     else
       asm volatile("" : "+f"(sum[i])::"memory");
@@ -101,6 +101,13 @@ template <int kN>
 VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
   static_assert(kN % 16 == 0 && kN >= 64 && kN <= 256);
   VLA_WGMMA_OF_ANY_SIZE("k16.f32.bf16.bf16", ", 1, 1, 0, 0", "+f");
+}
+
+/// sum[64, kN] (+)= a[64, 32] * b[kN, 32]^T of signed bytes, exactly, else as wgmma_bf16.
+template <int kN>
+VLA_DEVICE void wgmma_s8(int (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
+  static_assert(kN % 16 == 0 && kN >= 64 && kN <= 256);
+  VLA_WGMMA_OF_ANY_SIZE("k32.s32.s8.s8", "", "+r");
 }
 
 }  // namespace vla::cuda::dev

@@ -98,7 +98,7 @@ constexpr HopperTile kHopperTiles[] = {
     VLA_HOPPER_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 };
-constexpr int kHopperDepth = 64;  // step of the depth, and unit of a split
+constexpr int kHopperDepth = 64;  // step of the depth, and unit of a split: each has one at least
 /// Bytes of a step, and steps that shared memory holds: eight, or what the largest of a block on Hopper has room for.
 constexpr int hopper_stage_bytes(int columns, int rows) { return (columns + rows) * kHopperDepth * 2; }
 constexpr int hopper_stages(int columns, int rows) {

@@ -3,25 +3,13 @@
 #include "cuda/kernels/linear_int8.h"
 
 #include "cuda/kernels/finish.h"
+#include "cuda/kernels/row_scale.h"
 #include "cuda/kernels/store_sums.h"
 
 namespace vla::cuda {
 namespace {
 
 constexpr int kDepth = Int8Tile::kDepth;
-
-/// float(sum) * (scale of the column / scale of the row). After a row's codes come its scale and the sum of its codes.
-struct RowScale {
-  float s;
-  int sum;
-  VLA_DEVICE RowScale(const LinearInt8Job& job, int row) {
-    const std::byte* behind = job.x + row * job.x_stride + job.depth;
-    s = *reinterpret_cast<const float*>(behind), sum = *reinterpret_cast<const int*>(behind + 4);
-  }
-  VLA_DEVICE float scaled(int product, float scale) const {
-    return dev::multiply(static_cast<float>(product), dev::divide(scale, s));
-  }
-};
 
 /// Stores two adjacent sums: the sums themselves if the depth is split, else y. The first block of a split subtracts
 /// the offset.

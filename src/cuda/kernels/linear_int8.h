@@ -61,6 +61,45 @@ inline Launch linear_int8(CodeKind kind, Int8Shape shape, const LinearInt8Job& j
           128,
           n_stage * size * (Int8Tile::kDepth + (ternary ? 16 : 64))};
 }
+
+/// Tiles of kernels for Hopper alone (hopper_linear_int8.cu): columns, a multiple of 64, and rows, a multiple of 16.
+/// Those of int8 matrices, whose codes take four times as much shared memory, and more for ternary ones.
+#define VLA_HOPPER_INT8_TILES(each)                                                                                  \
+  each(64, 64) each(64, 128) each(128, 64) each(128, 96) each(128, 128) each(128, 160) each(128, 176) each(128, 192) \
+      each(128, 224) each(192, 112)
+#define VLA_HOPPER_TERNARY_TILES(each) \
+  VLA_HOPPER_INT8_TILES(each) each(128, 256) each(192, 160) each(192, 192) each(192, 224)
+struct HopperInt8Tile {
+  const char* kernel;
+  CodeKind kind;
+  int columns, rows;
+};
+constexpr HopperInt8Tile kHopperInt8Tiles[] = {
+#define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_int8_" #columns "x" #rows, CodeKind::int8, columns, rows},
+    VLA_HOPPER_INT8_TILES(VLA_HOPPER_TILE)
+#undef VLA_HOPPER_TILE
+#define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_ternary_" #columns "x" #rows, CodeKind::ternary, columns, rows},
+        VLA_HOPPER_TERNARY_TILES(VLA_HOPPER_TILE)
+#undef VLA_HOPPER_TILE
+};
+constexpr int kHopperInt8Depth = 128;  // step of the depth, and unit of a split: each has one at least
+/// Shared memory holds a few stages of rows of x and of packed codes, three of codes in rows, and at last the sums.
+constexpr int kHopperInt8Stages = 4, kHopperCodeStages = 3;
+constexpr int hopper_int8_stage_bytes(CodeKind kind, int columns, int rows) {
+  return rows * kHopperInt8Depth + columns * kHopperInt8Depth / (kind == CodeKind::ternary ? 4 : 1);
+}
+constexpr int hopper_int8_shared(CodeKind kind, int columns, int rows) {
+  const int stages = kHopperInt8Stages * hopper_int8_stage_bytes(kind, columns, rows);
+  const int all = stages + kHopperCodeStages * columns * kHopperInt8Depth, sums = rows * (columns + 4) * 4;
+  return all > sums ? all : sums;
+}
+inline Launch hopper_linear_int8(const HopperInt8Tile& tile, const LinearInt8Job& job) {
+  return {tile.kernel,
+          {blocks(job.n_row, tile.rows), blocks(job.n_column, tile.columns), static_cast<unsigned>(job.n_split)},
+          static_cast<unsigned>(tile.columns) * 2,
+          static_cast<unsigned>(hopper_int8_shared(tile.kind, tile.columns, tile.rows))};
+}
+
 inline Launch finish_int8_partial(const LinearInt8Job& job) {
   return {"linear_int8_finish", {blocks(job.n_column, 256), static_cast<unsigned>(job.n_row)}, 128};
 }

@@ -135,9 +135,7 @@ class Bench {
     const std::int64_t stride = round_up(size.depth, 8);
     for (const HopperTile& tile : kHopperTiles)
       for (const int n_split : {1, 2, 3, 4, 6, 8}) {
-        const unsigned n_block = blocks(size.n_row, tile.rows) * blocks(size.n_column, tile.columns);
-        if (n_split > 1 && n_block * static_cast<unsigned>(n_split - 1) > 2U * static_cast<unsigned>(gpu_->n_sm()))
-          break;
+        if (!is_worth(size, tile.columns, tile.rows, n_split)) continue;
         std::vector<LinearBf16Job> jobs;
         for (const Buffer& matrix : matrices)
           jobs.push_back({x.as<void>(), matrix.as<std::uint16_t>(), stride, stride, size.n_row, size.n_column,
@@ -168,7 +166,26 @@ class Bench {
         if (n_split > 1) launches.push_back(finish_int8_partial(jobs[0]));
         VLA_CHECK(tell(kind, size, name, n_split, jobs, launches));
       }
+    if (!gpu_->is_hopper() || size.n_row <= 32) return {};
+    for (const HopperInt8Tile& tile : kHopperInt8Tiles)
+      for (const int n_split : {1, 2, 3, 4, 6, 8}) {
+        if (tile.kind != code || !is_worth(size, tile.columns, tile.rows, n_split)) continue;
+        std::vector<LinearInt8Job> jobs;
+        for (const Buffer& matrix : matrices)
+          jobs.push_back({x.as<std::byte>(), matrix.as<std::byte>(), scale.as<float>(), stride, size.n_row,
+                          size.n_column, static_cast<int>(kernels::quantized_depth(size.depth)), n_split,
+                          partial.as<int>(), end});
+        std::vector<Launch> launches = {hopper_linear_int8(tile, jobs[0])};
+        if (n_split > 1) launches.push_back(finish_int8_partial(jobs[0]));
+        VLA_CHECK(tell(kind, size, tile.kernel, n_split, jobs, launches));
+      }
     return {};
+  }
+  /// Whether SMs that would have nothing to do take part in a split, and each share has a step.
+  bool is_worth(const Size& size, int columns, int rows, int n_split) const {
+    const auto n_sm = static_cast<unsigned>(gpu_->n_sm()), before = static_cast<unsigned>(n_split - 1);
+    const unsigned n_block = blocks(size.n_row, rows) * blocks(size.n_column, columns);
+    return n_split == 1 || (n_block * before <= 2 * n_sm && size.depth >= n_split * 128);
   }
 
   /// As many matrices as no cache holds together, but no more than there are launches, of the pattern again and again.

@@ -1,0 +1,179 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "cuda/kernels/finish.h"
+#include "cuda/kernels/hopper.h"
+
+/// What products in tiles for Hopper share. A block computes kColumns x kRows sums: y transposed, since the second size
+/// of a warpgroup's product may be any multiple of 16, and rows are fewer than columns. Each warpgroup has 64 columns
+/// of y and all rows.
+namespace vla::cuda {
+
+/// Copies a step of 128 bytes of the depth of kRows rows to swizzled rows, eight threads a row, padded with zeros after
+/// the last row and the depth. Strides and depth are in bytes.
+template <int kRows, int kThreads>
+class FetchRows {
+ public:
+  VLA_DEVICE FetchRows(const void* from, std::int64_t stride, int row0, int n_row, int depth)
+      : stride_(stride * kRowsAtOnce), n_left_(n_row - row0 - thread_index() / 8), depth_(depth) {
+    const int chunk = thread_index() % 8, row = thread_index() / 8;
+    from_ = static_cast<const std::byte*>(from) + (row0 + row) * stride + chunk * 16;
+    to_ = swizzled(row, chunk);
+  }
+  VLA_DEVICE void operator()(std::byte* stage, int step) const {
+    const int left = depth_ - step * kSwizzledRow - thread_index() % 8 * 16;
+    const int size = left < 0 ? 0 : left > 16 ? 16 : left;
+    const std::byte* from = from_ + static_cast<std::int64_t>(step) * kSwizzledRow;
+#pragma unroll
+    for (int i = 0; i < kRows; i += kRowsAtOnce) {
+      if (kRows % kRowsAtOnce != 0 && i + thread_index() / 8 >= kRows) break;
+      dev::copy_async(stage + to_ + i * kSwizzledRow, from, i < n_left_ ? size : 0);
+      from += stride_;
+    }
+  }
+
+ private:
+  static constexpr int kRowsAtOnce = kThreads / 8;
+  static_assert(kRowsAtOnce % kSwizzledRows == 0);
+  const std::byte* from_;  // of this thread's first row; nothing is read where a copy's size is 0
+  std::int64_t stride_;
+  int n_left_, depth_, to_;
+};
+
+/// Four adjacent elements of a row, of which n are there; together: they are aligned to their size, and all there.
+struct Four {
+  float of[4];
+};
+VLA_DEVICE Four load_four(const float* from, bool together, int n) {
+  Four to = {};
+  if (together) {
+    const float4 four = *reinterpret_cast<const float4*>(from);
+    to.of[0] = four.x, to.of[1] = four.y, to.of[2] = four.z, to.of[3] = four.w;
+  } else {
+#pragma unroll
+    for (int i = 0; i < 4; ++i)
+      if (i < n) to.of[i] = from[i];
+  }
+  return to;
+}
+VLA_DEVICE void store_four(unsigned* to, const unsigned (&from)[4], bool together, int n) {
+  if (together) {
+    *reinterpret_cast<uint4*>(to) = uint4{from[0], from[1], from[2], from[3]};
+  } else {
+#pragma unroll
+    for (int i = 0; i < 4; ++i)
+      if (i < n) to[i] = from[i];
+  }
+}
+VLA_DEVICE void store_four(std::uint16_t* to, const Four& from, bool together, int n) {
+  const unsigned low = dev::to_bf16(from.of[0], from.of[1]), high = dev::to_bf16(from.of[2], from.of[3]);
+  if (together) {
+    *reinterpret_cast<uint2*>(to) = uint2{low, high};
+  } else {
+    const unsigned pairs[2] = {low, high};
+#pragma unroll
+    for (int i = 0; i < 4; ++i)
+      if (i < n) to[i] = static_cast<std::uint16_t>(pairs[i / 2] >> i % 2 * 16);
+  }
+}
+
+/// The end of a tile, whose sums pass through shared memory, where rows of y have kColumns words and four more against
+/// bank conflicts. A thread has the same four columns of every eighth row.
+template <int kColumns, int kRows>
+class TileEnd {
+ public:
+  template <class Job>
+  VLA_DEVICE TileEnd(const Job& job, int row0, int column0)
+      : e_(job.end), row0_(row0), n_column_(job.n_column), column_(column0 + thread_index() % kQuads * 4) {
+    n_ = job.n_column - column_;
+    const int left = job.n_row - row0;
+    end_ = n_ <= 0 ? 0 : left < kRows ? left : kRows;
+    const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
+    const auto all = bits(e_.bias) | bits(e_.factor) | bits(e_.gate) | bits(e_.residual) | bits(e_.y);
+    together_ = job.n_column % 4 == 0 && e_.y_stride % 4 == 0 && (all | bits(job.partial)) % 16 == 0;
+  }
+
+  /// Writes a thread's sums of wgmma; lanes of a warp write to different banks.
+  template <class T>
+  static VLA_DEVICE void place(const T (&sum)[kRows / 2], std::byte* to) {
+    const int lane = thread_index() % kLanes, column = thread_index() / kLanes * 16 + lane / 4;
+#pragma unroll
+    for (int i = 0; i < kRows / 2; ++i) {
+      const int row = i / 4 * 8 + lane % 4 * 2 + i % 2;
+      dev::write(to + (row * (kColumns + 4) + column + i / 2 % 2 * 8) * 4, sum[i]);
+    }
+  }
+
+  /// Leaves word(of_row(row), sum), as bits, to the share of the depth that begins at `partial`.
+  template <class OfRow, class Word>
+  VLA_DEVICE void leave(const std::byte* sums, void* partial, OfRow of_row, Word word) const {
+    auto* to = static_cast<unsigned*>(partial) + static_cast<std::int64_t>(row0_) * n_column_ + column_;
+#pragma unroll 1
+    for (int first = thread_index() / kQuads; first < end_; first += 8 * kBatch)
+#pragma unroll
+      for (int i = 0; i < kBatch; ++i) {
+        const int row = first + 8 * i;
+        if (row >= end_) break;
+        const auto of = of_row(row0_ + row);
+        const uint4 four = sums_of(sums, row);
+        const unsigned words[4] = {word(of, four.x), word(of, four.y), word(of, four.z), word(of, four.w)};
+        store_four(to + static_cast<std::int64_t>(row) * n_column_, words, together_, n_);
+      }
+  }
+  /// Computes y of value(of_row(row), bits of a sum, which of the four columns). Loads of kBatch rows are under way at
+  /// a time.
+  template <class OfRow, class Value>
+  VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value) const {
+    Four bias = {}, factor = {};
+    if (e_.bias && n_ > 0) bias = load_four(e_.bias + column_, together_, n_);
+    if (e_.factor && n_ > 0) factor = load_four(e_.factor + column_, together_, n_);
+#pragma unroll 1
+    for (int first = thread_index() / kQuads; first < end_; first += 8 * kBatch) {
+      Four gate[kBatch] = {}, residual[kBatch] = {};
+      decltype(of_row(0)) of[kBatch] = {};
+#pragma unroll
+      for (int i = 0; i < kBatch; ++i) {
+        const int row = row0_ + first + 8 * i;
+        if (first + 8 * i >= end_) break;
+        of[i] = of_row(row);
+        const std::int64_t at = static_cast<std::int64_t>(row) * n_column_ + column_;
+        if (e_.gate) gate[i] = load_four(e_.gate + at, together_, n_);
+        if (e_.residual) residual[i] = load_four(e_.residual + at, together_, n_);
+      }
+#pragma unroll
+      for (int i = 0; i < kBatch; ++i) {
+        if (first + 8 * i >= end_) break;
+        const uint4 four = sums_of(sums, first + 8 * i);
+        const unsigned words[4] = {four.x, four.y, four.z, four.w};
+        Four y;
+#pragma unroll
+        for (int c = 0; c < 4; ++c)
+          y.of[c] =
+              cuda::finish(e_, value(of[i], words[c], c), bias.of[c], factor.of[c], gate[i].of[c], residual[i].of[c]);
+        store(row0_ + first + 8 * i, y);
+      }
+    }
+  }
+
+ private:
+  static constexpr int kQuads = kColumns / 4, kBatch = 4;
+
+  VLA_DEVICE uint4 sums_of(const std::byte* sums, int row) const {
+    return dev::read<uint4>(sums + (row * (kColumns + 4) + thread_index() % kQuads * 4) * 4);
+  }
+  VLA_DEVICE void store(std::int64_t row, const Four& y) const {
+    const std::int64_t at = row * e_.y_stride + column_;
+    if (e_.is_bf16) return store_four(static_cast<std::uint16_t*>(e_.y) + at, y, together_, n_);
+    const unsigned words[4] = {
+        static_cast<unsigned>(dev::bits_of(y.of[0])), static_cast<unsigned>(dev::bits_of(y.of[1])),
+        static_cast<unsigned>(dev::bits_of(y.of[2])), static_cast<unsigned>(dev::bits_of(y.of[3]))};
+    store_four(static_cast<unsigned*>(e_.y) + at, words, together_, n_);
+  }
+
+  const Epilogue& e_;
+  int row0_, n_column_, column_, n_, end_;  // n: columns from column on; end: rows of the tile
+  bool together_;
+};
+
+}  // namespace vla::cuda
