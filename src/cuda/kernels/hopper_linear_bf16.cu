@@ -57,6 +57,7 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
     next = next + 1 == T::kStages ? 0 : next + 1;
   } while (++i < n);
 
+  dev::let_next_begin();
   dev::wgmma_wait_all(sum);
   dev::wait_copies<0>();
   __syncthreads();  // the stages' memory is reused for sums

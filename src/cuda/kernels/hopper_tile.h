@@ -149,8 +149,8 @@ class TileEnd {
         Four y;
 #pragma unroll
         for (int c = 0; c < 4; ++c)
-          y.of[c] =
-              cuda::finish(e_, value(of[i], words[c], c), bias.of[c], factor.of[c], gate[i].of[c], residual[i].of[c]);
+          y.of[c] = cuda::finish(e_, e_.gate != nullptr, value(of[i], words[c], c), bias.of[c], factor.of[c],
+                                 gate[i].of[c], residual[i].of[c]);
         store(row0_ + first + 8 * i, y);
       }
     }

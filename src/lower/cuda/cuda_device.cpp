@@ -34,8 +34,8 @@ Result<std::unique_ptr<Device>> CudaDevice::open(const cuda::Driver& driver, int
 
 Result<std::unique_ptr<Device>> CudaDevice::model(const std::string& name, Rounding at_load) {
   VLA_TRY(const GpuModel found, find_gpu_model(name));
-  std::unique_ptr<CudaDevice> device(
-      new CudaDevice(std::string("model of ") + found.description, std::make_shared<CudaQueue>(found.n_sm), at_load));
+  std::unique_ptr<CudaDevice> device(new CudaDevice(std::string("model of ") + found.description,
+                                                    std::make_shared<CudaQueue>(found.n_sm, found.is_hopper), at_load));
   device->model_ = found;
   return std::unique_ptr<Device>(std::move(device));
 }
@@ -100,7 +100,8 @@ Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const Low
                          .min_rounded_keys = min_rounded_keys_,
                          .keeps_taps = true,
                          .alignment = kDeviceAlignment};
-  CudaLowering l = {{.graph = graph, .options = options, .target = target}, weights_, queue_->n_sm()};
+  CudaLowering l = {
+      {.graph = graph, .options = options, .target = target}, weights_, queue_->n_sm(), queue_->is_hopper()};
   start(l);
   std::vector<FusedOp> ops = fuse(l);
   store(l, ops);

@@ -28,6 +28,7 @@ struct CudaOp : Step {
 struct CudaLowering : Lowering {
   const CudaWeights& weights;
   int n_sm;  // blocks that run at a time
+  bool is_hopper;
   std::vector<CudaOp> ops = {};
   std::vector<cuda::Address> data = {};  // of each base, when memory is there
 
@@ -53,8 +54,8 @@ struct CudaLowering : Lowering {
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 
 /// How blocks of a product cut rows: in 128, in 64, or few rows bound by reading the matrix; strips are of so many
-/// columns of up to 64 rows. And how many shares of the depth have blocks of their own.
-enum class ProductShape { few, strip16, strip32, strip64, strip128, rows64, rows128 };
+/// columns of up to 64 rows; Hopper has tiles of its own. And how many shares of the depth have blocks of their own.
+enum class ProductShape { few, strip16, strip32, strip64, strip128, rows64, rows128, hopper };
 /// Columns of a strip; 0 for other shapes.
 constexpr std::int64_t strip_width(ProductShape shape) {
   return shape == ProductShape::strip16    ? 16
@@ -66,10 +67,15 @@ constexpr std::int64_t strip_width(ProductShape shape) {
 struct ProductCut {
   ProductShape shape;
   int n_split;
+  std::size_t tile = 0;  // of kHopperTiles or kHopperInt8Tiles
+  double us = 0;         // that it takes on Hopper, as it was estimated
 };
 /// The width of strips of several products together whose depth is not split, 16 to 64.
 unsigned widest_strip(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
-ProductCut cut_product(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
+/// The tile for Hopper that takes the shortest time.
+ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
+ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
+                       std::int64_t depth);
 
 /// How blocks cut rows of queries and shares of keys.
 struct AttentionPlan {

@@ -48,10 +48,12 @@ class CudaQueue {
   static Result<std::unique_ptr<CudaQueue>> open(const cuda::Driver& driver, int index,
                                                  const std::vector<std::string>& modules);
   /// A queue without a device: dry from the beginning.
-  explicit CudaQueue(int n_sm) : n_sm_(n_sm), is_dry_(true) {}
+  CudaQueue(int n_sm, bool is_hopper) : n_sm_(n_sm), is_hopper_(is_hopper), is_dry_(true) {}
   ~CudaQueue();
 
   int n_sm() const { return n_sm_; }
+  /// Whether kernels for Hopper alone run.
+  bool is_hopper() const { return is_hopper_; }
   /// As the driver names the device.
   std::string device_name() const { return gpu_ ? gpu_->name() : ""; }
   const Status& failure() const { return failure_; }
@@ -88,7 +90,8 @@ class CudaQueue {
 
  private:
   using Parts = std::vector<const CudaPart*>;
-  explicit CudaQueue(std::shared_ptr<cuda::Gpu> gpu) : n_sm_(gpu->n_sm()), is_dry_(false), gpu_(std::move(gpu)) {}
+  explicit CudaQueue(std::shared_ptr<cuda::Gpu> gpu)
+      : n_sm_(gpu->n_sm()), is_hopper_(gpu->is_hopper()), is_dry_(false), gpu_(std::move(gpu)) {}
   /// Bytes in host memory that the device reads and writes by itself.
   struct HostMemory {
     cuda::Owned memory;
@@ -112,6 +115,7 @@ class CudaQueue {
   Status capture(const CudaPart& part);
 
   int n_sm_;
+  bool is_hopper_;
   bool is_dry_;
   cuda::Address next_ = 1 << 20;  // where memory would lie that is not allocated
   std::shared_ptr<cuda::Gpu> gpu_;

@@ -51,6 +51,7 @@ constexpr GpuModel kModels[] = {
     {.name = "h100",
      .description = "H100 SXM 80 GB, 132 SMs at 1.83 GHz",
      .n_sm = 132,
+     .is_hopper = true,
      .clock = 1.83 * kGiga,
      .bf16 = 0.62 * 989 * kTera,
      .int8 = 0.62 * 1979 * kTera,
@@ -150,7 +151,8 @@ class Costs {
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
       const bool has_codes = kind == MatrixKind::ternary || kind == MatrixKind::int8;
       const bool is_one = linear.gated && op.gate == kNone;
-      const ProductShape shape = cut_product(kind, rows, is_one ? 2 * columns : columns, weight.shape[0], l.n_sm).shape;
+      const ProductCut cut = cut_product(l, kind, rows, is_one ? 2 * columns : columns, weight.shape[0]);
+      const ProductShape shape = cut.shape;
       const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
       if (kind == MatrixKind::f32) {  // rows and columns behind the last are multiplied as well
@@ -160,6 +162,8 @@ class Costs {
         const std::int64_t n_block = (columns + width - 1) / width * ((rows + 63) / 64) * op.n_split;
         const std::int64_t bytes = (std::min<std::int64_t>(rows, 64) + width) * weight.shape[0] * 2 / op.n_split;
         add_blocks(cost, static_cast<double>(n_block), static_cast<double>(bytes) / (kSmBytes * gpu.clock));
+      } else if (shape == ProductShape::hopper) {
+        add_blocks(cost, gpu.n_sm, cut.us * kMicro);
       } else if (shape == ProductShape::few) {
         add_blocks(cost, gpu.n_sm, flop_of(*node) / (has_codes ? gpu.dot4 : gpu.f32));
       } else {

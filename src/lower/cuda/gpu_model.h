@@ -13,7 +13,8 @@ namespace vla::lower {
 struct GpuModel {
   const char *name, *description;
   int n_sm;
-  double clock;       // Hz
+  bool is_hopper = false;  // has its own kernels
+  double clock;            // Hz
   double bf16, int8;  // operations a second of tensor units by our instructions (mma.sync), sums in float32 and int32
   double f32, dot4;   // of fused multiply-adds of floats, and of four bytes at a time
   double bandwidth;   // bytes a second

@@ -24,6 +24,7 @@ cuda::Bf16Shape bf16_shape(ProductShape shape) {
     case ProductShape::rows64:
       return cuda::Bf16Shape::rows64;
     case ProductShape::rows128:
+    case ProductShape::hopper:
       break;
   }
   return cuda::Bf16Shape::rows128;
@@ -39,7 +40,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                  const cuda::Epilogue& end, const op::Linear* gate, Calls& calls) {
   const Value& x = l.value(of);
   const int rows = narrow(rows_of(x.shape)), columns = narrow(weight.shape[1]), depth = narrow(x.shape[0]);
-  const ProductShape shape = cut_product(matrix.kind, rows, gate ? 2 * columns : columns, depth, l.n_sm).shape;
+  const auto [shape, n_split, tile, us] = cut_product(l, matrix.kind, rows, gate ? 2 * columns : columns, depth);
   switch (matrix.kind) {
     case MatrixKind::f32: {
       const cuda::LinearF32Job job = {.x = l.at(of),
@@ -65,7 +66,9 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .end = end,
                                        .gate_weight = gate ? l.param<std::uint16_t>(gate->weight) : nullptr,
                                        .gate_bias = gate ? l.param(gate->bias) : nullptr};
-      calls.push_back(call(cuda::linear_bf16(bf16_shape(shape), job), job));
+      calls.push_back(call(shape == ProductShape::hopper ? cuda::hopper_linear_bf16(cuda::kHopperTiles[tile], job)
+                                                         : cuda::linear_bf16(bf16_shape(shape), job),
+                           job));
       if (job.n_split > 1) calls.push_back(call(cuda::finish_bf16_partial(job), job));
       return;
     }
@@ -82,7 +85,9 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .partial = l.at<int>(op.partial),
                                        .end = end};
       const auto kind = matrix.kind == MatrixKind::ternary ? cuda::CodeKind::ternary : cuda::CodeKind::int8;
-      calls.push_back(call(cuda::linear_int8(kind, int8_shape(shape), job), job));
+      calls.push_back(call(shape == ProductShape::hopper ? cuda::hopper_linear_int8(cuda::kHopperInt8Tiles[tile], job)
+                                                         : cuda::linear_int8(kind, int8_shape(shape), job),
+                           job));
       if (job.n_split > 1) calls.push_back(call(cuda::finish_int8_partial(job), job));
       return;
     }
