@@ -1,5 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/products.h"
 
@@ -29,24 +31,34 @@ TEST_CASE("bf16 products in tiles for Hopper are as near to doubles") {
   }
   counts = {};
   for (const ProductCase& c : kHopperCases) {
-    const Operands of(c, true);
-    const std::vector<double> expected = of.expected();
     const std::int64_t stride = round_up(c.depth, 8) + 8;
     for (const HopperTile& tile : kHopperTiles) {
+      Operands of(c, true);
+      // What the gate's product is, is the gate of what is expected.
+      Operands gate({c.n_row, c.depth, c.n_column, 1, Activation::none, c.has_bias}, true);
+      if (tile.is_gated) {
+        std::reverse_copy(of.weight.begin(), of.weight.end(), gate.weight.begin());
+        const std::vector<double> made = gate.expected();
+        std::copy(made.begin(), made.end(), of.gate.begin()), of.c.has_gate = true;
+      }
+      const std::vector<double> expected = of.expected();
       INFO(tile.kernel, ", ", c.n_row, " x ", c.depth, " x ", c.n_column);
       in_every_schedule([&] {
-        const std::vector<float> y = run_product(of, [&](const Epilogue& end) {
-          const Device<float> partial(static_cast<std::size_t>(c.n_split * c.n_row * c.n_column));
+        const std::vector<float> y = run_product(of, [&](Epilogue end) {
+          if (tile.is_gated) end.gate = nullptr;
+          const Device<float> partial(static_cast<std::size_t>(2 * c.n_split * c.n_row * c.n_column)), bias(gate.bias);
+          const Device<std::uint16_t> gate_weight(bf16_rows(gate.weight, c.depth, stride));
           const Device<std::uint16_t> x(bf16_rows(of.x, c.depth, stride)),
               weight(bf16_rows(of.weight, c.depth, stride));
-          const LinearBf16Job job = {x.get(), weight.get(), stride,
-                                     stride,  c.n_row,      c.n_column,
-                                     c.depth, c.n_split,    c.n_split > 1 ? partial.get() : nullptr,
-                                     end};
+          LinearBf16Job job = {x.get(), weight.get(), stride,
+                               stride,  c.n_row,      c.n_column,
+                               c.depth, c.n_split,    c.n_split > 1 ? partial.get() : nullptr,
+                               end,     {},           {}};
+          if (tile.is_gated) job.gate_weight = gate_weight.get(), job.gate_bias = c.has_bias ? bias.get() : nullptr;
           launch(hopper_linear_bf16(tile, job), job);
           if (c.n_split > 1) launch(finish_bf16_partial(job), job);
         });
-        CHECK(error(y, expected) < (c.is_bf16 ? 4e-3 : 1e-6 + bf16_sum_error(c.depth)));
+        CHECK(error(y, expected) < (c.is_bf16 ? 4e-3 : (tile.is_gated ? 2 : 1) * (1e-6 + bf16_sum_error(c.depth))));
       });
     }
   }

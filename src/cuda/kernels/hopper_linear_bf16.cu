@@ -6,21 +6,30 @@
 namespace vla::cuda {
 namespace {
 
-template <int kColumns_, int kRows_>
+template <int kColumns_, int kRows_, bool kGated_>
 struct Tile {
+  static constexpr bool kGated = kGated_;
   static constexpr int kColumns = kColumns_, kRows = kRows_, kThreads = kColumns * 2;
   static constexpr int kStages = hopper_stages(kColumns, kRows), kStage = hopper_stage_bytes(kColumns, kRows);
   static constexpr int kBytesW = kColumns * kSwizzledRow;
+  static constexpr int kColumnsY = kGated ? kColumns / 2 : kColumns;
 };
 
 template <class T>
 VLA_DEVICE void multiply(const LinearBf16Job& job) {
   std::byte* shared = dev::shared_memory();
-  const int row0 = static_cast<int>(blockIdx.x) * T::kRows, column0 = static_cast<int>(blockIdx.y) * T::kColumns;
+  const int row0 = static_cast<int>(blockIdx.x) * T::kRows, column0 = static_cast<int>(blockIdx.y) * T::kColumnsY;
   const int n_step = (job.depth + kHopperDepth - 1) / kHopperDepth, z = static_cast<int>(blockIdx.z);
   const int first = n_step * z / job.n_split, n = n_step * (z + 1) / job.n_split - first;
-  const FetchRows<T::kColumns, T::kThreads> fetch_w(job.weight, job.weight_stride * 2, column0, job.n_column,
-                                                    job.depth * 2);
+  // Rows of the gate's matrix come first.
+  const FetchRows<T::kColumnsY, T::kThreads> fetch_matrix(job.weight, job.weight_stride * 2, column0, job.n_column,
+                                                          job.depth * 2);
+  const FetchRows<T::kColumnsY, T::kThreads> fetch_gate(job.gate_weight, job.weight_stride * 2, column0, job.n_column,
+                                                        job.depth * 2);
+  const auto fetch_w = [&](std::byte* stage, int step) {
+    if constexpr (T::kGated) fetch_gate(stage, step);
+    fetch_matrix(stage + (T::kColumns - T::kColumnsY) * kSwizzledRow, step);
+  };
   const FetchRows<T::kRows, T::kThreads> fetch_x(job.x, job.x_stride * 2, row0, job.n_row, job.depth * 2);
 
   float sum[T::kRows / 2] = {};
@@ -61,13 +70,13 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
   dev::wgmma_wait_all(sum);
   dev::wait_copies<0>();
   __syncthreads();  // the stages' memory is reused for sums
-  using End = TileEnd<T::kColumns, T::kRows>;
+  using End = TileEnd<T::kColumns, T::kRows, T::kGated>;
   End::place(sum, shared);
   __syncthreads();
-  const End end(job, row0, column0);
+  const End end(job, job.gate_bias, row0, column0);
   const auto nothing = [](int) { return 0; };
   if (job.n_split > 1)
-    end.leave(shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_column, nothing,
+    end.leave(shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_sum(), nothing,
               [](int, unsigned bits) { return bits; });
   else
     end.finish(shared, nothing, [](int, unsigned bits, int) { return dev::float_of(static_cast<int>(bits)); });
@@ -77,8 +86,15 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
 
 #define VLA_HOPPER_KERNEL(columns, rows)                                                   \
   VLA_EARLY_KERNEL(hopper_linear_bf16_##columns##x##rows, columns * 2, 1, LinearBf16Job) { \
-    multiply<Tile<columns, rows>>(job);                                                    \
+    multiply<Tile<columns, rows, false>>(job);                                             \
   }
 VLA_HOPPER_TILES(VLA_HOPPER_KERNEL)
+#undef VLA_HOPPER_KERNEL
+#define VLA_HOPPER_KERNEL(columns, rows)                                                           \
+  VLA_EARLY_KERNEL(hopper_linear_bf16_##columns##x##rows##_gated, columns * 2, 1, LinearBf16Job) { \
+    multiply<Tile<columns, rows, true>>(job);                                                      \
+  }
+VLA_HOPPER_GATED_TILES(VLA_HOPPER_KERNEL)
+#undef VLA_HOPPER_KERNEL
 
 }  // namespace vla::cuda

@@ -125,10 +125,10 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   dev::wgmma_wait_all(sum);
   dev::wait_copies<0>();
   __syncthreads();  // the stages' memory is reused for sums
-  using End = TileEnd<T::kColumns, T::kRows>;
+  using End = TileEnd<T::kColumns, T::kRows, false>;
   End::place(sum, shared);
   __syncthreads();
-  const End end(job, row0, column0);
+  const End end(job, nullptr, row0, column0);
   const auto of_row = [&](int row) { return RowScale(job, row); };
   // Ternary codes are stored plus 1: the first share of the depth subtracts what that adds.
   const auto exact = [&](const RowScale& of, unsigned bits) {

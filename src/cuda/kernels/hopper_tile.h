@@ -79,18 +79,23 @@ VLA_DEVICE void store_four(std::uint16_t* to, const Four& from, bool together, i
 }
 
 /// The end of a tile, whose sums pass through shared memory, where rows of y have kColumns words and four more against
-/// bank conflicts. A thread has the same four columns of every eighth row.
-template <int kColumns, int kRows>
+/// bank conflicts. A thread has the same four columns of every few rows. Gated: the first half of a row are sums of the
+/// gate's matrix, the second those of the same columns of the other.
+template <int kColumns, int kRows, bool kGated>
 class TileEnd {
  public:
   template <class Job>
-  VLA_DEVICE TileEnd(const Job& job, int row0, int column0)
-      : e_(job.end), row0_(row0), n_column_(job.n_column), column_(column0 + thread_index() % kQuads * 4) {
+  VLA_DEVICE TileEnd(const Job& job, const float* gate_bias, int row0, int column0)
+      : e_(job.end),
+        gate_bias_(gate_bias),
+        row0_(row0),
+        n_column_(job.n_column),
+        column_(column0 + thread_index() % kQuads * 4) {
     n_ = job.n_column - column_;
     const int left = job.n_row - row0;
     end_ = n_ <= 0 ? 0 : left < kRows ? left : kRows;
     const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
-    const auto all = bits(e_.bias) | bits(e_.factor) | bits(e_.gate) | bits(e_.residual) | bits(e_.y);
+    const auto all = bits(e_.bias) | bits(e_.factor) | bits(e_.gate) | bits(e_.residual) | bits(e_.y) | bits(gate_bias);
     together_ = job.n_column % 4 == 0 && e_.y_stride % 4 == 0 && (all | bits(job.partial)) % 16 == 0;
   }
 
@@ -105,62 +110,75 @@ class TileEnd {
     }
   }
 
-  /// Leaves word(of_row(row), sum), as bits, to the share of the depth that begins at `partial`.
+  /// Leaves word(of_row(row), sum), as bits, to the share of the depth that begins at `partial`, whose rows have the
+  /// gate's sums first.
   template <class OfRow, class Word>
   VLA_DEVICE void leave(const std::byte* sums, void* partial, OfRow of_row, Word word) const {
-    auto* to = static_cast<unsigned*>(partial) + static_cast<std::int64_t>(row0_) * n_column_ + column_;
+    constexpr int kHalves = kGated ? 2 : 1;
+    auto* to = static_cast<unsigned*>(partial) + column_;
 #pragma unroll 1
-    for (int first = thread_index() / kQuads; first < end_; first += 8 * kBatch)
+    for (int first = thread_index() / kQuads; first < end_; first += kRowsAtOnce * kBatch)
 #pragma unroll
       for (int i = 0; i < kBatch; ++i) {
-        const int row = first + 8 * i;
+        const int row = first + kRowsAtOnce * i;
         if (row >= end_) break;
         const auto of = of_row(row0_ + row);
-        const uint4 four = sums_of(sums, row);
-        const unsigned words[4] = {word(of, four.x), word(of, four.y), word(of, four.z), word(of, four.w)};
-        store_four(to + static_cast<std::int64_t>(row) * n_column_, words, together_, n_);
+#pragma unroll
+        for (int half = 0; half < kHalves; ++half) {
+          const uint4 four = sums_of(sums, row, half);
+          const unsigned words[4] = {word(of, four.x), word(of, four.y), word(of, four.z), word(of, four.w)};
+          const std::int64_t at = static_cast<std::int64_t>(row0_ + row) * kHalves + half;
+          store_four(to + at * n_column_, words, together_, n_);
+        }
       }
   }
   /// Computes y of value(of_row(row), bits of a sum, which of the four columns). Loads of kBatch rows are under way at
   /// a time.
   template <class OfRow, class Value>
   VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value) const {
-    Four bias = {}, factor = {};
+    Four bias = {}, factor = {}, gate_bias = {};
     if (e_.bias && n_ > 0) bias = load_four(e_.bias + column_, together_, n_);
+    if (kGated && gate_bias_ && n_ > 0) gate_bias = load_four(gate_bias_ + column_, together_, n_);
     if (e_.factor && n_ > 0) factor = load_four(e_.factor + column_, together_, n_);
 #pragma unroll 1
-    for (int first = thread_index() / kQuads; first < end_; first += 8 * kBatch) {
+    for (int first = thread_index() / kQuads; first < end_; first += kRowsAtOnce * kBatch) {
       Four gate[kBatch] = {}, residual[kBatch] = {};
       decltype(of_row(0)) of[kBatch] = {};
 #pragma unroll
       for (int i = 0; i < kBatch; ++i) {
-        const int row = row0_ + first + 8 * i;
-        if (first + 8 * i >= end_) break;
+        const int row = row0_ + first + kRowsAtOnce * i;
+        if (first + kRowsAtOnce * i >= end_) break;
         of[i] = of_row(row);
         const std::int64_t at = static_cast<std::int64_t>(row) * n_column_ + column_;
-        if (e_.gate) gate[i] = load_four(e_.gate + at, together_, n_);
+        if (!kGated && e_.gate) gate[i] = load_four(e_.gate + at, together_, n_);
         if (e_.residual) residual[i] = load_four(e_.residual + at, together_, n_);
       }
 #pragma unroll
       for (int i = 0; i < kBatch; ++i) {
-        if (first + 8 * i >= end_) break;
-        const uint4 four = sums_of(sums, first + 8 * i);
+        if (first + kRowsAtOnce * i >= end_) break;
+        const uint4 four = sums_of(sums, first + kRowsAtOnce * i, kGated ? 1 : 0);
         const unsigned words[4] = {four.x, four.y, four.z, four.w};
+        if constexpr (kGated) {
+          const uint4 others = sums_of(sums, first + kRowsAtOnce * i, 0);
+          const unsigned gates[4] = {others.x, others.y, others.z, others.w};
+#pragma unroll
+          for (int c = 0; c < 4; ++c) gate[i].of[c] = dev::add(value(of[i], gates[c], c), gate_bias.of[c]);
+        }
         Four y;
 #pragma unroll
         for (int c = 0; c < 4; ++c)
-          y.of[c] = cuda::finish(e_, e_.gate != nullptr, value(of[i], words[c], c), bias.of[c], factor.of[c],
+          y.of[c] = cuda::finish(e_, kGated || e_.gate != nullptr, value(of[i], words[c], c), bias.of[c], factor.of[c],
                                  gate[i].of[c], residual[i].of[c]);
-        store(row0_ + first + 8 * i, y);
+        store(row0_ + first + kRowsAtOnce * i, y);
       }
     }
   }
 
  private:
-  static constexpr int kQuads = kColumns / 4, kBatch = 4;
+  static constexpr int kQuads = kColumns / 4 / (kGated ? 2 : 1), kRowsAtOnce = kColumns * 2 / kQuads, kBatch = 4;
 
-  VLA_DEVICE uint4 sums_of(const std::byte* sums, int row) const {
-    return dev::read<uint4>(sums + (row * (kColumns + 4) + thread_index() % kQuads * 4) * 4);
+  VLA_DEVICE uint4 sums_of(const std::byte* sums, int row, int half) const {
+    return dev::read<uint4>(sums + (row * (kColumns + 4) + (half * kQuads + thread_index() % kQuads) * 4) * 4);
   }
   VLA_DEVICE void store(std::int64_t row, const Four& y) const {
     const std::int64_t at = row * e_.y_stride + column_;
@@ -172,6 +190,7 @@ class TileEnd {
   }
 
   const Epilogue& e_;
+  const float* gate_bias_;
   int row0_, n_column_, column_, n_, end_;  // n: columns from column on; end: rows of the tile
   bool together_;
 };

@@ -20,8 +20,8 @@ struct LinearBf16Job {
   int n_split;
   float* partial;
   Epilogue end;
-  /// Of strips alone: y = activation(x gate^T + gate_bias) * (x w^T + bias) and so on, in the place of a gate that is
-  /// there already. Partial sums of the gate stand before the others in a row of 2 n_column.
+  /// Of strips and of tiles for Hopper alone: y = activation(x gate^T + gate_bias) * (x w^T + bias) and so on, in the
+  /// place of a gate that is there already. Partial sums of the gate stand before the others in a row of 2 n_column.
   const std::uint16_t* gate_weight = nullptr;
   const float* gate_bias = nullptr;
 
@@ -89,13 +89,21 @@ inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
       each(128, 176) each(128, 192) each(128, 208) each(128, 224) each(128, 240) each(128, 256) each(192, 112)       \
           each(192, 128) each(192, 160) each(192, 192) each(192, 208) each(192, 224) each(192, 240) each(256, 96)    \
               each(256, 112) each(256, 128) each(256, 160)
+/// The same for both matrices of a gated product, of each of which a tile has half of its columns.
+#define VLA_HOPPER_GATED_TILES(each)                                                                     \
+  each(128, 96) each(128, 128) each(128, 160) each(128, 192) each(128, 224) each(128, 256) each(256, 96) \
+      each(256, 128) each(256, 160)
 struct HopperTile {
   const char* kernel;
   int columns, rows;
+  bool is_gated;
 };
 constexpr HopperTile kHopperTiles[] = {
-#define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_bf16_" #columns "x" #rows, columns, rows},
+#define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_bf16_" #columns "x" #rows, columns, rows, false},
     VLA_HOPPER_TILES(VLA_HOPPER_TILE)
+#undef VLA_HOPPER_TILE
+#define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_bf16_" #columns "x" #rows "_gated", columns, rows, true},
+        VLA_HOPPER_GATED_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 };
 constexpr int kHopperDepth = 64;  // step of the depth, and unit of a split: each has one at least
@@ -108,7 +116,8 @@ constexpr int hopper_stages(int columns, int rows) {
 inline Launch hopper_linear_bf16(const HopperTile& tile, const LinearBf16Job& job) {
   // Blocks side by side read the same columns, so that the matrix comes from memory once.
   return {tile.kernel,
-          {blocks(job.n_row, tile.rows), blocks(job.n_column, tile.columns), static_cast<unsigned>(job.n_split)},
+          {blocks(job.n_row, tile.rows), blocks(job.n_column, tile.is_gated ? tile.columns / 2 : tile.columns),
+           static_cast<unsigned>(job.n_split)},
           static_cast<unsigned>(tile.columns) * 2,
           static_cast<unsigned>(hopper_stages(tile.columns, tile.rows) * hopper_stage_bytes(tile.columns, tile.rows))};
 }

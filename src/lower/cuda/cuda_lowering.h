@@ -73,9 +73,11 @@ struct ProductCut {
 /// The width of strips of several products together whose depth is not split, 16 to 64.
 unsigned widest_strip(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
 /// The tile for Hopper that takes the shortest time.
-ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
+ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, bool is_gated,
+                          int n_sm);
+/// is_gated: one kernel multiplies both matrices of a gated product, which have n_column together.
 ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
-                       std::int64_t depth);
+                       std::int64_t depth, bool is_gated);
 
 /// How blocks cut rows of queries and shares of keys.
 struct AttentionPlan {

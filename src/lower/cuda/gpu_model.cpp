@@ -151,7 +151,7 @@ class Costs {
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
       const bool has_codes = kind == MatrixKind::ternary || kind == MatrixKind::int8;
       const bool is_one = linear.gated && op.gate == kNone;
-      const ProductCut cut = cut_product(l, kind, rows, is_one ? 2 * columns : columns, weight.shape[0]);
+      const ProductCut cut = cut_product(l, kind, rows, is_one ? 2 * columns : columns, weight.shape[0], is_one);
       const ProductShape shape = cut.shape;
       const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));

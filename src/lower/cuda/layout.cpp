@@ -70,7 +70,7 @@ class CudaLayouts final : Layouts {
     const std::int64_t depth = l.value(op.x).shape[0], n_row = count(y) / y[0];
     const bool is_one = op.gated && multiplies_both(op, n_row);
     const std::int64_t n_column = is_one ? 2 * y[0] : y[0];
-    const ProductCut cut = cut_product(l, kind, n_row, n_column, depth);
+    const ProductCut cut = cut_product(l, kind, n_row, n_column, depth, is_one);
     if (kind == MatrixKind::ternary || kind == MatrixKind::int8)
       round(step, op, DType::i8, kernels::quantized_stride(depth), "round");
     else if (kind == MatrixKind::bf16 && cut.shape != ProductShape::few)
@@ -83,10 +83,11 @@ class CudaLayouts final : Layouts {
     if (has_gate) made.writes.push_back(made.gate = add_rows(y));
     split(made, cut.n_split, n_column * n_row);
   }
-  /// Whether strips have columns of both matrices of a gated product.
+  /// Whether a block has columns of both matrices of a gated product.
   bool multiplies_both(const LinearOp& op, std::int64_t n_row) const {
     return std::all_of(op.linears.begin(), op.linears.end(), [&](const Node* node) {
-      return l.matrix(*node).kind == MatrixKind::bf16 && is_of_strips(n_row, l.value(op.x).shape[0]);
+      return l.matrix(*node).kind == MatrixKind::bf16 &&
+             (is_of_strips(n_row, l.value(op.x).shape[0]) || (l.is_hopper && n_row > 64));
     });
   }
   /// n: floats that each share of a product or of attention leaves.
@@ -188,11 +189,12 @@ unsigned widest_strip(std::int64_t n_row, std::int64_t n_column, std::int64_t de
 }
 
 ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
-                       std::int64_t depth) {
+                       std::int64_t depth, bool is_gated) {
   const int n_sm = l.n_sm;
   const bool is_bf16 = kind == MatrixKind::bf16, is_few = n_row <= (is_bf16 ? cuda::kBf16FewRows : 4);
   if (is_bf16 && is_of_strips(n_row, depth)) return cut_in_strips(n_row, n_column, depth, n_sm);
-  if (l.is_hopper && kind != MatrixKind::f32 && n_row > 64) return cut_for_hopper(kind, n_row, n_column, depth, n_sm);
+  if (l.is_hopper && kind != MatrixKind::f32 && n_row > 64)
+    return cut_for_hopper(kind, n_row, n_column, depth, is_gated, n_sm);
   const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
   const ProductShape shape = is_few                          ? ProductShape::few
                              : n_row > 64 && n_large >= n_sm ? ProductShape::rows128

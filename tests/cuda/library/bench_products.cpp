@@ -126,7 +126,7 @@ class Bench {
         if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
         VLA_CHECK(tell("bf16", size, name, n_split, jobs, launches));
       }
-    if (gpu_->is_hopper() && size.n_row > 32) return run_hopper(size, x, matrices, partial, end);
+    if (timer_.gpu().is_hopper() && size.n_row > 32) return run_hopper(size, x, matrices, partial, end);
     return {};
   }
 
@@ -135,11 +135,16 @@ class Bench {
     const std::int64_t stride = round_up(size.depth, 8);
     for (const HopperTile& tile : kHopperTiles)
       for (const int n_split : {1, 2, 3, 4, 6, 8}) {
-        if (!is_worth(size, tile.columns, tile.rows, n_split)) continue;
+        // Both matrices of a gated product, each of half of the columns, are as much work.
+        if (!is_worth(size, tile.columns, tile.rows, n_split) || (tile.is_gated && size.n_column % 2 != 0)) continue;
         std::vector<LinearBf16Job> jobs;
-        for (const Buffer& matrix : matrices)
-          jobs.push_back({x.as<void>(), matrix.as<std::uint16_t>(), stride, stride, size.n_row, size.n_column,
-                          size.depth, n_split, partial.as<float>(), end});
+        for (const Buffer& matrix : matrices) {
+          const int n_column = tile.is_gated ? size.n_column / 2 : size.n_column;
+          const auto* weight = matrix.as<std::uint16_t>();
+          jobs.push_back({x.as<void>(), weight, stride, stride, size.n_row, n_column, size.depth, n_split,
+                          partial.as<float>(), end});
+          if (tile.is_gated) jobs.back().gate_weight = weight + n_column * stride;
+        }
         std::vector<Launch> launches = {hopper_linear_bf16(tile, jobs[0])};
         if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
         VLA_CHECK(tell("bf16", size, tile.kernel, n_split, jobs, launches));
@@ -166,7 +171,7 @@ class Bench {
         if (n_split > 1) launches.push_back(finish_int8_partial(jobs[0]));
         VLA_CHECK(tell(kind, size, name, n_split, jobs, launches));
       }
-    if (!gpu_->is_hopper() || size.n_row <= 32) return {};
+    if (!timer_.gpu().is_hopper() || size.n_row <= 32) return {};
     for (const HopperInt8Tile& tile : kHopperInt8Tiles)
       for (const int n_split : {1, 2, 3, 4, 6, 8}) {
         if (tile.kind != code || !is_worth(size, tile.columns, tile.rows, n_split)) continue;
@@ -182,8 +187,8 @@ class Bench {
     return {};
   }
   /// Whether SMs that would have nothing to do take part in a split, and each share has a step.
-  bool is_worth(const Size& size, int columns, int rows, int n_split) const {
-    const auto n_sm = static_cast<unsigned>(gpu_->n_sm()), before = static_cast<unsigned>(n_split - 1);
+  bool is_worth(const Size& size, int columns, int rows, int n_split) {
+    const auto n_sm = static_cast<unsigned>(timer_.gpu().n_sm()), before = static_cast<unsigned>(n_split - 1);
     const unsigned n_block = blocks(size.n_row, rows) * blocks(size.n_column, columns);
     return n_split == 1 || (n_block * before <= 2 * n_sm && size.depth >= n_split * 128);
   }
