@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ROOT / "src"
 #                Ampere, Orin,       Ada, Hopper, Thor, Blackwell
 ARCHITECTURES = (80, 86, 87, 89, 90, 110, 120)
-TENSOR = ("IMMA", "HMMA")
+TENSOR = ("IMMA", "HMMA", "IGMMA", "HGMMA")
 # Cycles of the tensor unit of a quarter of an SM for 16 x 8 x 32 bytes (IMMA) and 16 x 8 x 16 bf16 with sums in float32
 # (HMMA), from peak rates that NVIDIA publishes, without sparsity: AGX Orin 85 TOPS int8 and 43 TFLOPS of 16 SMs at
 # 1.3 GHz, RTX 3060 102 TOPS and 26 TFLOPS of 28 SMs at 1.78 GHz. An integer instruction of a warp takes two cycles.
@@ -99,6 +99,8 @@ def assemble(ptx, sm, out):
     cubin = Path(out) / f"{ptx.stem}.sm_{sm}.cubin"
     arch = f"-arch=sm_{sm}{'a' if ptx.stem.endswith('a') else ''}"
     told = run([tool("ptxas"), "-v", arch, ptx, "-o", cubin])
+    if "serialized" in told:  # wgmma that the assembler lets wait for each other
+        raise RuntimeError(told)
     kernels = {}
     for part in told.split("Compiling entry function")[1:]:
         name = re.match(r" '(\S+)'", part)[1]

@@ -144,6 +144,47 @@ TEST_CASE("PTX: races in shared memory, and barriers that some miss") {
   CHECK(fault_of_body(copy + "cp.async.wait_group 0;\nld.shared.u32 %r4, [%r2];").empty());
 }
 
+TEST_CASE("PTX: products of a warpgroup whose operands or sums are not ready, or touched too early") {
+  // Thread t writes 16 bytes of a and 16 of b, rows of 128 bytes in 8 KB and 1 KB: zeros. Sums are ones.
+  const std::string sums = "{%f0, %f1, %f2, %f3}";
+  const std::string operands =
+      "mov.u32 %r8, room;\nmov.u32 %r9, 0;\nshl.b32 %r2, %r1, 7;\nadd.s32 %r2, %r2, %r8;\n"
+      "st.shared.v4.u32 [%r2], {%r9, %r9, %r9, %r9};\nst.shared.v4.u32 [%r2+16], {%r9, %r9, %r9, %r9};\n"
+      "cvt.u64.u32 %rd4, %r8;\nshr.u64 %rd4, %rd4, 4;\nor.b64 %rd4, %rd4, 4611686293305360384;\n"
+      "mov.f32 %f0, 0f3f800000;\nmov.f32 %f1, %f0;\nmov.f32 %f2, %f0;\nmov.f32 %f3, %f0;\n"
+      "mov.u32 %r3, 1;\nsetp.ne.b32 %p1, %r3, 0;\n";
+  const std::string visible = "fence.proxy.async.shared::cta;\n", barrier = "bar.sync 0;\n",
+                    fence = "wgmma.fence.sync.aligned;\n",
+                    multiply = "wgmma.mma_async.sync.aligned.m64n8k16.f32.bf16.bf16 " + sums +
+                               ", %rd4, %rd4, %p1, 1, 1, 0, 0;\n",
+                    commit = "wgmma.commit_group.sync.aligned;\n", wait = "wgmma.wait_group.sync.aligned 0;\n",
+                    store = "setp.lt.s32 %p2, %r1, 32;\n@%p2 st.global.f32 [%rd3], %f1;\n";
+  const auto fault = [&](const std::string& body) {
+    return fault_of([&] {
+      const PtxModule module(kernel_of(operands + body));
+      const Device<std::uint32_t> y(64);
+      std::uint32_t* p = y.get();
+      device_memory().begin_launch();
+      run_ptx(*module.find("k"), {1, 1, 1}, 128, 16 << 10, &p);
+      CHECK(y.host()[0] == 0x3f800000);
+    });
+  };
+  in_every_schedule([&] {
+    CHECK(fault(visible + barrier + fence + multiply + commit + wait + store).empty());
+    CHECK(contains(fault(barrier + fence + multiply + commit + wait + store), "no fence.proxy.async has made visible"));
+    CHECK(contains(fault(visible + fence + multiply + commit + wait + store), "race in shared memory"));
+    CHECK(contains(fault(visible + barrier + multiply + commit + wait + store), "without wgmma.fence"));
+    CHECK(contains(fault(visible + barrier + fence + multiply + commit + store + wait), "has not waited for"));
+    CHECK(
+        !fault(visible + barrier + fence + multiply + wait + store).empty());  // as warps come: touched, or never ended
+    CHECK(contains(fault(visible + barrier + fence + multiply + commit), "while wgmma is under way"));
+    CHECK(contains(fault(visible + barrier + fence + multiply + commit + "st.shared.u32 [%r2], %r9;\n" + wait),
+                   "writes what wgmma reads"));
+    CHECK(contains(fault(visible + barrier + "shl.b64 %rd4, %rd4, 1;\n" + fence + multiply + commit + wait),
+                   "matrix descriptor"));
+  });
+}
+
 TEST_CASE("bank conflicts are counted as lanes that wait") {
   const auto conflicts = [](int factor, int width) {
     counts = {};

@@ -300,6 +300,24 @@ MISTAKES = {
         "together_ = job.n_column % 4 == 0 &&",
         "together_ =",
     ),
+    "the gate's matrix comes second": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "if constexpr (T::kGated) fetch_gate(stage, step);\n    fetch_matrix(stage + (T::kColumns - T::kColumnsY) * kSwizzledRow, step);",
+        "fetch_matrix(stage, step);\n    if constexpr (T::kGated) fetch_gate(stage + T::kColumnsY * kSwizzledRow, step);",
+    ),
+    "a share of the gate's sums in the place of another": (
+        "hopper_tile.h",
+        "hopper_linear_bf16",
+        "(row0_ + row) * kHalves + half;",
+        "(row0_ + row) * kHalves + kHalves - 1 - half;",
+    ),
+    "the gate's bias is not added": (
+        "hopper_tile.h",
+        "hopper_linear_bf16",
+        "dev::add(value(of[i], gates[c], c), gate_bias.of[c])",
+        "value(of[i], gates[c], c)",
+    ),
     "codes are unpacked before they came": (
         "hopper_linear_int8.cu",
         "hopper_linear_int8",

@@ -86,12 +86,11 @@ inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
 /// Tiles of kernels for Hopper alone (hopper_linear_bf16.cu): columns, a multiple of 64, and rows, a multiple of 16.
 #define VLA_HOPPER_TILES(each)                                                                                       \
   each(64, 64) each(64, 128) each(128, 64) each(128, 96) each(128, 112) each(128, 128) each(128, 144) each(128, 160) \
-      each(128, 176) each(128, 192) each(128, 208) each(128, 224) each(128, 240) each(128, 256) each(192, 112)       \
-          each(192, 128) each(192, 160) each(192, 192) each(192, 208) each(192, 224) each(192, 240) each(256, 96)    \
-              each(256, 112) each(256, 128) each(256, 160)
+      each(128, 176) each(128, 192) each(128, 224) each(128, 256) each(192, 112) each(192, 160) each(192, 192)       \
+          each(192, 224) each(256, 112) each(256, 128) each(256, 160)
 /// The same for both matrices of a gated product, of each of which a tile has half of its columns.
-#define VLA_HOPPER_GATED_TILES(each)                                                                     \
-  each(128, 96) each(128, 128) each(128, 160) each(128, 192) each(128, 224) each(128, 256) each(256, 96) \
+#define VLA_HOPPER_GATED_TILES(each)                                                                      \
+  each(128, 96) each(128, 128) each(128, 160) each(128, 192) each(128, 224) each(128, 256) each(256, 112) \
       each(256, 128) each(256, 160)
 struct HopperTile {
   const char* kernel;

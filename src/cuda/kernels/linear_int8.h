@@ -64,11 +64,10 @@ inline Launch linear_int8(CodeKind kind, Int8Shape shape, const LinearInt8Job& j
 
 /// Tiles of kernels for Hopper alone (hopper_linear_int8.cu): columns, a multiple of 64, and rows, a multiple of 16.
 /// Those of int8 matrices, whose codes take four times as much shared memory, and more for ternary ones.
-#define VLA_HOPPER_INT8_TILES(each)                                                                                  \
-  each(64, 64) each(64, 128) each(128, 64) each(128, 96) each(128, 128) each(128, 160) each(128, 176) each(128, 192) \
-      each(128, 224) each(192, 112)
+#define VLA_HOPPER_INT8_TILES(each) \
+  each(64, 64) each(64, 128) each(128, 64) each(128, 96) each(128, 128) each(128, 176) each(128, 224)
 #define VLA_HOPPER_TERNARY_TILES(each) \
-  VLA_HOPPER_INT8_TILES(each) each(128, 256) each(192, 160) each(192, 192) each(192, 224)
+  VLA_HOPPER_INT8_TILES(each) each(128, 160) each(128, 192) each(128, 256) each(192, 112) each(192, 160) each(192, 224)
 struct HopperInt8Tile {
   const char* kernel;
   CodeKind kind;
