@@ -143,7 +143,7 @@ def main():
         copy_scripts(kit)
         options.out.mkdir(parents=True, exist_ok=True)
         archive = options.out / f"{NAME}.tar.xz"
-        with tarfile.open(archive, "w:xz") as tar:
+        with tarfile.open(archive, "w:xz", preset=9) as tar:  # whose window is larger than a program, as all have the same PTX
             tar.add(kit, arcname=NAME, filter=owned_by_nobody)
     size = archive.stat().st_size
     print(f"{archive}: {size / (1 << 20):.1f} MiB")
