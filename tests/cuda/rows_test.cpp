@@ -51,7 +51,7 @@ std::vector<std::byte> quantized(const std::vector<float>& x, std::int64_t n) {
 
 TEST_CASE("norms of a sum are within 2e-6 of doubles, and the sum is what was added") {
   for (RowNorm kind : {RowNorm::layer, RowNorm::rms, RowNorm::none})
-    for (int n : {2, 31, 256, 1000, 2560,
+    for (int n : {2, 31, 256, 1000, 2560, 6912,
                   kind == RowNorm::layer ? kMaxKept
                   : kind == RowNorm::rms ? kMaxKept + 1
                                          : 3}) {
@@ -80,7 +80,7 @@ TEST_CASE("norms of a sum are within 2e-6 of doubles, and the sum is what was ad
 }
 
 TEST_CASE("codes of rows are the CPU's to the bit") {
-  for (int n : {1, 63, 64, 300, 1000, 2560, kMaxKept + 3}) {
+  for (int n : {1, 63, 64, 300, 1000, 2560, 6912, kMaxKept + 3}) {
     INFO(n);
     Numbers numbers;
     std::vector<float> x = numbers.floats(6 * n);

@@ -114,13 +114,18 @@ VLA_DEVICE void norm_in_registers(const NormJob& job) {
   const bool whole = n % 4 == 0 && job.x_stride % 4 == 0 && is_aligned(job.x, 16) && is_aligned(job.residual, 16) &&
                      is_aligned(job.sum, 16) && is_aligned(job.weight, 16) && is_aligned(job.bias, 16);
   const auto place = [](int j) { return 4 * (thread_index() + kNormThreads * j); };
+  // Weights have registers where a row takes few; else they are read when they are used.
+  constexpr bool kEarly = kGroups <= 2;
   float x[kGroups][4], residual[kGroups][4], weight[kGroups][4], bias[kGroups][4];
+  const auto load_weights = [&](int j) {
+    if (job.weight) load_four(weight[j], job.weight, place(j), n, whole);
+    if (job.bias) load_four(bias[j], job.bias, place(j), n, whole);
+  };
 #pragma unroll
   for (int j = 0; j < kGroups; ++j) {
     load_four(x[j], job.x + row * job.x_stride, place(j), n, whole);
     if (job.residual) load_four(residual[j], job.residual + row * n, place(j), n, whole);
-    if (job.weight) load_four(weight[j], job.weight, place(j), n, whole);
-    if (job.bias) load_four(bias[j], job.bias, place(j), n, whole);
+    if (kEarly) load_weights(j);
   }
   float sum = 0;
 #pragma unroll
@@ -145,13 +150,15 @@ VLA_DEVICE void norm_in_registers(const NormJob& job) {
     factor = 1 / sqrtf(sum_of_block(squares, 1) / static_cast<float>(n) + job.eps);
   }
 #pragma unroll
-  for (int j = 0; j < kGroups; ++j)
+  for (int j = 0; j < kGroups; ++j) {
+    if (!kEarly) load_weights(j);
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
       x[j][k] = dev::multiply(x[j][k] - mean, factor);
       if (job.weight) x[j][k] = dev::multiply(x[j][k], weight[j][k]);
       if (job.bias) x[j][k] = dev::add(x[j][k], bias[j][k]);
     }
+  }
   if (job.type == RowType::codes) return store_codes(static_cast<std::byte*>(job.y) + row * job.y_stride, n, x);
   const bool stores_four = n % 4 == 0 && job.y_stride % 4 == 0 && is_aligned(job.y, 16);
 #pragma unroll
@@ -173,7 +180,8 @@ VLA_DEVICE void norm_in_registers(const NormJob& job) {
 }  // namespace
 
 VLA_KERNEL(norm_rows_2, 256, 4, NormJob) { norm_in_registers<2>(job); }
-VLA_KERNEL(norm_rows_8, 256, 1, NormJob) { norm_in_registers<8>(job); }
+VLA_KERNEL(norm_rows_4, 256, 3, NormJob) { norm_in_registers<4>(job); }
+VLA_KERNEL(norm_rows_8, 256, 2, NormJob) { norm_in_registers<8>(job); }
 
 /// A block computes one row, which stays in shared memory if it fits.
 VLA_KERNEL(norm_rows, 256, 4, NormJob) {

@@ -28,7 +28,12 @@ constexpr int kMaxKept = 24576;  // wider rows are read again; narrower ones sta
 constexpr int kNormThreads = 256;
 inline Launch norm_rows(const NormJob& job) {
   if (job.n <= 8192)  // a row in registers
-    return {job.n <= 2048 ? "norm_rows_2" : "norm_rows_8", {static_cast<unsigned>(job.n_row)}, kNormThreads, 128};
+    return {job.n <= 2048   ? "norm_rows_2"
+            : job.n <= 4096 ? "norm_rows_4"
+                            : "norm_rows_8",
+            {static_cast<unsigned>(job.n_row)},
+            kNormThreads,
+            128};
   const int n_kept = job.n <= kMaxKept ? job.n : 0;
   return {"norm_rows", {static_cast<unsigned>(job.n_row)}, 256, static_cast<unsigned>(n_kept * 4 + 64)};
 }

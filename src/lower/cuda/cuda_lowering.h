@@ -71,7 +71,7 @@ struct ProductCut {
   double us = 0;         // that it takes on Hopper, as it was estimated
 };
 /// The width of strips of several products together whose depth is not split, 16 to 64.
-unsigned widest_strip(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
+unsigned common_width(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
 /// The tile for Hopper that takes the shortest time.
 ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, bool is_gated,
                           int n_sm);

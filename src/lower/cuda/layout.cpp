@@ -156,34 +156,36 @@ std::int64_t blocks_of(std::int64_t n_row, std::int64_t n_column, std::int64_t r
   return (n_row + rows - 1) / rows * ((n_column + columns - 1) / columns);
 }
 
-/// Microseconds of strips: measured on an H200, an SM reads about 40 bytes a nanosecond from the second-level cache,
-/// and a kernel that adds shares takes 2 us, beside the traffic of its sums.
+/// Microseconds of strips, as an H200 took them: a warp waits for each of its steps of the depth, and a kernel that
+/// adds shares takes 2 us, beside the traffic of its sums.
 double strip_us(std::int64_t width, int n_split, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
                 int n_sm) {
-  constexpr double kOfSm = 40e3, kOfAll = 3e6, kFinish = 2;  // bytes and microseconds
+  constexpr double kBegin = 2, kOfAll = 2.5e6, kFinish = 2;
   const std::int64_t n_block = blocks_of(n_row, n_column, 64, width) * n_split;
-  const std::int64_t of_block = (std::min<std::int64_t>(n_row, 64) + width) * depth * 2 / n_split;
-  const double us = static_cast<double>((n_block + n_sm - 1) / n_sm * of_block) / kOfSm;
+  const std::int64_t n_warp = width <= 32 ? 8 : 256 / width;  // that share the depth
+  const std::int64_t of_warp =
+      (depth + cuda::kBf16Depth * n_warp * n_split - 1) / (cuda::kBf16Depth * n_warp * n_split);
+  const double of_step = width == 16 ? 1.0 : 1.4;
+  const double us = kBegin + static_cast<double>((n_block + n_sm - 1) / n_sm * of_warp) * of_step;
   return n_split == 1 ? us : us + kFinish + static_cast<double>(2 * 4 * n_row * n_column * n_split) / kOfAll;
 }
 
 /// The strips, and shares of the depth, that take the shortest time.
 ProductCut cut_in_strips(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
-  ProductCut best = {ProductShape::strip16, 1};
-  double least = std::numeric_limits<double>::max();
+  ProductCut best = {ProductShape::strip16, 1, 0, std::numeric_limits<double>::max()};
   for (const ProductShape shape :
        {ProductShape::strip16, ProductShape::strip32, ProductShape::strip64, ProductShape::strip128})
     for (const int n_split : {1, 2, 4, 8}) {
       if (n_split > 1 && depth / n_split < 8 * cuda::kBf16Depth) break;
       const double us = strip_us(strip_width(shape), n_split, n_row, n_column, depth, n_sm);
-      if (us < least) least = us, best = {shape, n_split};
+      if (us < best.us) best = {shape, n_split, 0, us};
     }
   return best;
 }
 
 }  // namespace
 
-unsigned widest_strip(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
+unsigned common_width(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
   const auto us = [&](unsigned width) { return strip_us(width, 1, n_row, n_column, depth, n_sm); };
   return std::min({16U, 32U, 64U}, [&](unsigned a, unsigned b) { return us(a) < us(b); });
 }
@@ -192,9 +194,16 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
                        std::int64_t depth, bool is_gated) {
   const int n_sm = l.n_sm;
   const bool is_bf16 = kind == MatrixKind::bf16, is_few = n_row <= (is_bf16 ? cuda::kBf16FewRows : 4);
-  if (is_bf16 && is_of_strips(n_row, depth)) return cut_in_strips(n_row, n_column, depth, n_sm);
-  if (l.is_hopper && kind != MatrixKind::f32 && n_row > 64)
-    return cut_for_hopper(kind, n_row, n_column, depth, is_gated, n_sm);
+  const bool has_tiles = l.is_hopper && kind != MatrixKind::f32 && !is_few;
+  if (is_bf16 && is_of_strips(n_row, depth)) {
+    const ProductCut strips = cut_in_strips(n_row, n_column, depth, n_sm);
+    if (!has_tiles) return strips;
+    // Strips of q, k and v are one launch; tiles are streams that fork and join.
+    constexpr double kFork = 1;
+    const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, is_gated, n_sm);
+    return tiles.us + kFork < strips.us ? tiles : strips;
+  }
+  if (has_tiles && n_row > 64) return cut_for_hopper(kind, n_row, n_column, depth, is_gated, n_sm);
   const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
   const ProductShape shape = is_few                          ? ProductShape::few
                              : n_row > 64 && n_large >= n_sm ? ProductShape::rows128

@@ -62,7 +62,7 @@ void merge_calls(std::vector<Calls>& phase, int n_sm) {
       [&](cuda::Several<cuda::LinearBf16Job>& jobs) {
         std::int64_t n_column = 0;
         for (int i = 0; i < jobs.n; ++i) n_column += jobs.job[i].n_column;
-        return cuda::linear_strips(widest_strip(jobs.job[0].n_row, n_column, jobs.job[0].depth, n_sm), jobs);
+        return cuda::linear_strips(common_width(jobs.job[0].n_row, n_column, jobs.job[0].depth, n_sm), jobs);
       });
   merge<cuda::HeadJob>(
       phase, is_heads, [](const auto&, const auto&) { return true; },
