@@ -268,8 +268,16 @@ Status Stream::launch_job(const Launch& how, const void* job) {
   void* parameters[] = {const_cast<void*>(job)};  // the driver copies what it points at
   LaunchAttribute overlaps = {kOverlaps, 0, {1}};
   const bool may_overlap = follows_kernel_ && gpu_->capability_ >= 90;
-  const LaunchConfig config = {how.grid.x, how.grid.y, how.grid.z,    how.n_thread, 1,
-                               1,          how.shared, stream_.get(), &overlaps,    may_overlap ? 1U : 0U};
+  const LaunchConfig config = {.grid_x = how.grid.x,
+                               .grid_y = how.grid.y,
+                               .grid_z = how.grid.z,
+                               .block_x = how.n_thread,
+                               .block_y = 1,
+                               .block_z = 1,
+                               .shared = how.shared,
+                               .stream = stream_.get(),
+                               .attributes = &overlaps,
+                               .n_attribute = may_overlap ? 1U : 0U};
   follows_kernel_ = true;
   return CALL(launch, &config, function, parameters, nullptr);
 }

@@ -23,7 +23,7 @@ struct Rates {
 // 0.85 of the tensor units' peak.
 constexpr Rates kBf16 = {38.9e3, 60.8e3, 0.355, 1.2, 1.3, 4.4e-5, 0},
                 kCodes = {0.85 * 32 * 1755, 56e3, 0, 0, 1.5, 4 * 132 / 2.5e6, 2};
-constexpr double kOfAll = 2.5e6;  // bytes that all SMs write to memory in a microsecond
+constexpr double kWritten = 2.5e6;  // bytes that all SMs write to memory in a microsecond
 
 /// A tile of a table, and the bytes that a step of 128 bytes of the depth reads.
 struct Candidate {
@@ -66,7 +66,7 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
       const double of_block = rates.block + static_cast<double>(ceil_of(n_step, n_split)) * of_step + rates.end * size;
       const std::int64_t n_block = ceil_of(n_row, tile.rows) * ceil_of(n_column, tile.columns) * n_split;
       double us = rates.kernel + static_cast<double>(ceil_of(n_block, n_sm)) * of_block;
-      if (n_split > 1) us += rates.finish + static_cast<double>(4 * n_row * n_column * (n_split + 1)) / kOfAll;
+      if (n_split > 1) us += rates.finish + static_cast<double>(4 * n_row * n_column * (n_split + 1)) / kWritten;
       if (us < best.us) best.n_split = n_split, best.tile = tile.index, best.us = us;
     }
   return best;
