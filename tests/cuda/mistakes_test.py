@@ -87,7 +87,7 @@ MISTAKES = {
         "kKind == CodeKind::ternary ?",
     ),
     "scales multiplied in another order": (
-        "linear_int8.cu",
+        "row_scale.h",
         "linear_int8",
         "dev::multiply(static_cast<float>(product), dev::divide(scale, s))",
         "dev::divide(dev::multiply(static_cast<float>(product), scale), s)",
@@ -119,14 +119,14 @@ MISTAKES = {
     "product and sum in one rounding": (
         "finish.h",
         "linear_int8",
-        "sum = dev::add(sum, e.bias[column]);",
-        "sum += e.bias[column] * 1.0000001f;",
+        "sum = dev::add(sum, bias);",
+        "sum += bias * 1.0000001f;",
     ),
     "columns behind the last are written": (
         "finish.h",
         "linear_int8",
-        "const bool has_second = column + 1 < n_column;",
-        "const bool has_second = true;",
+        "ends.has_second = column + 1 < n_column,",
+        "ends.has_second = true,",
     ),
     # Products of floats.
     "zeros are not filled in": ("device.h", "linear_bf16", '[%0], [%1], 16, %2;"', '[%0], [%1], 16, 16;"'),
@@ -165,15 +165,15 @@ MISTAKES = {
     "a split is added twice": (
         "linear_bf16.cu",
         "linear_bf16",
-        "for (int z = 0; z < job.n_split; ++z)",
-        "for (int z = -1; z < job.n_split; ++z)",
+        "sum.x += share[z].x, sum.y += share[z].y;",
+        "sum.x += (z == 1 ? 2 : 1) * share[z].x, sum.y += share[z].y;",
     ),
-    "the gate is not activated": ("finish.h", "linear_bf16", "activate(e.activation, e.gate[at])", "e.gate[at]"),
+    "the gate is not activated": ("finish.h", "linear_bf16", "activate(e.activation, gate)", "gate"),
     "the factor comes after the residual": (
         "finish.h",
         "linear_bf16",
-        "sum = dev::add(sum, e.residual[at]);",
-        "sum = dev::add(sum, e.residual[at]) * (e.factor ? e.factor[column] : 1);",
+        "sum = dev::add(sum, residual);",
+        "sum = dev::add(sum, residual) * factor;",
     ),
     "the last ReLU comes before the residual": (
         "finish.h",
@@ -460,8 +460,8 @@ MISTAKES = {
     "codes rounded half away from zero": (
         "rows.cu",
         "rows",
-        "dev::add(dev::multiply(value(i + b), s), kRound)",
-        "dev::add(floorf(dev::multiply(value(i + b), s) + 0.5f), kRound)",
+        "dev::add(dev::multiply(x, s), kRound)",
+        "dev::add(floorf(dev::multiply(x, s) + 0.5f), kRound)",
     ),
     "127 / a in one rounding": (
         "rows.cu",
@@ -507,7 +507,23 @@ MISTAKES = {
     "NaN is not the largest": ("window.cu", "window", "x > most || x != x", "x > most"),
     "an image too far": ("window.cu", "window", "view * job.height * job.width", "view * job.height * job.height"),
 }
-TESTS = {"linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*", "hopper_linear_int8": "*linear_int8_test*",
+MISTAKES |= {
+    # Strips of few rows.
+    "sums are added before all warps have theirs": ("linear_strip.cu", "linear_strip", "  __syncthreads();  // sums of all warps are there\n", ""),
+    "a strip does not wait for earlier kernels": ("linear_strip.cu", "linear_strip", "  dev::wait_for_earlier();\n", ""),
+    "a strip multiplies what lies behind the depth": ("linear_strip.cu", "linear_strip", "chunk < n_chunk_ ? *reinterpret", "true ? *reinterpret"),
+    "gate and product change places": ("linear_strip.cu", "linear_strip", "is_gate ? job.gate_weight : job.weight", "is_gate ? job.weight : job.gate_weight"),
+    "rows behind the last of a strip are stored": ("linear_strip.cu", "linear_strip", "row0 + row < job.n_row && column", "column"),
+    "halves of eight elements change places": ("linear_strip.cu", "linear_strip", "first[4] = {low.x, high.x, low.y, high.y}", "first[4] = {low.z, high.x, low.y, high.y}"),
+    "the gate's bias is left out": ("share.h", "linear_strip", "if (job.gate_bias == nullptr) return;", "return;"),
+    "shares of the gate lie where those of the product do": ("linear_strip.cu", "linear_strip", "job.n_sum() - job.n_column + column, has_second", "column, has_second"),
+    "a job's blocks begin one too late": ("device.h", "linear_strip", "blockIdx.x >= jobs.end[i]", "blockIdx.x > jobs.end[i]"),
+    # Rows in registers.
+    "zeros behind a row's end count as values": ("rows.cu", "rows", "squares += place(j) + k < n ?", "squares += true ?"),
+    "NaN keeps the device's bits": ("rows.cu", "rows", "rounded == rounded ?", "true ?"),
+    "a long row is looked up from its beginning only": ("rows.cu", "rows", "static_cast<int>(blockIdx.y) * kLookupBlock", "0"),
+}
+TESTS = {"linear_strip": "*linear_float_test*", "linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*", "hopper_linear_int8": "*linear_int8_test*",
          "attention": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*", "channel_attention": "*channel_attention_test*"}  # fmt: skip
 
 

@@ -227,7 +227,6 @@ class Reader {
     if (operation == nullptr) throw Fault("unknown instruction " + name);
     one.run = operation->run, one.kind = operation->kind;
     const std::string_view types = operation->operands;
-    kernel_.overlaps |= name == "griddepcontrol.wait";
     if (operands.size() != types.size()) throw Fault("another number of operands than " + std::string(types));
     int n_address = 0;
     for (std::size_t i = 0; i < types.size(); ++i) {
@@ -300,6 +299,7 @@ std::string without_comments(const std::string& text) {
 
 PtxModule::PtxModule(const std::string& text) {
   std::map<std::string, std::size_t> shared;
+  const bool overlaps = text.find(".target sm_90") != std::string::npos;  // as the driver launches it
   std::unique_ptr<Reader> reader;
   PtxKernel* kernel = nullptr;
   std::string statement;
@@ -319,7 +319,7 @@ PtxModule::PtxModule(const std::string& text) {
         const std::size_t open = statement.find('('), close = statement.find(')');
         const std::string name = words(statement.substr(0, open)).back();
         kernel = &kernels_[name];
-        kernel->name = name;
+        kernel->name = name, kernel->overlaps = overlaps;
         reader = std::make_unique<Reader>(*kernel, shared);
         for (const std::string& param : split(statement.substr(open + 1, close - open - 1), ',')) {
           const std::vector<std::string> parts = words(param);

@@ -29,6 +29,12 @@ MAIN_LOOPS = {
     "attention_bf16_256": ("HMMA.16816.F32.BF16", 64),
     "attention_bf16_256_32": ("HMMA.16816.F32.BF16", 64),
 }
+# Strips: two steps of 64 rows and 16 or 32 columns.
+STRIP_LOOPS = {
+    name: ("HMMA.16816.F32.BF16", 32 if "_16" in name else 64)
+    for width in (16, 32, 64, 128)
+    for name in (f"linear_strip_{width}", f"linear_strip_{width}_gated", *([f"linear_strips_{width}"] if width < 128 else []))
+}
 # Of a tile for Hopper a warpgroup multiplies 128 bytes of the depth.
 HOPPER_LOOP = {"bf16": "HGMMA.64x{}x16.F32.BF16", "int8": "IGMMA.64x{}x32.S8.S8", "ternary": "IGMMA.64x{}x32.S8.S8"}
 # An architecture takes ptxas and nvdisasm seven seconds.
@@ -98,7 +104,8 @@ def test_main_loops_have_the_tensor_instructions_that_they_need(machine_code):
     for (sm, name), (_, loop) in machine_code.items():
         tensor = {op: n for op, n in loop.items() if op.startswith(cuda_kernels.TENSOR)}
         if not name.startswith("hopper_"):
-            assert tensor == (dict([MAIN_LOOPS[name]]) if name in MAIN_LOOPS else {}), (sm, name)
+            expected = MAIN_LOOPS.get(name) or STRIP_LOOPS.get(name)
+            assert tensor == (dict([expected]) if expected else {}), (sm, name)
 
 
 def test_predictions_count_the_instructions_of_main_loops(machine_code):

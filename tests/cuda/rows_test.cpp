@@ -183,7 +183,7 @@ TEST_CASE("heads are normed and turned, into rows of another order") {
 
 TEST_CASE("rows are looked up in tables of every type, and an id outside is NaN") {
   const std::vector<std::int32_t> ids = {2, 0, 3, -1, 1};
-  const int n = 130, n_table = 3;
+  const int n = 1300, n_table = 3;  // more than a block looks up
   Numbers numbers;
   const std::vector<float> table = rounded_to_bf16(numbers.floats(n * n_table));
   const Device<float> whole(table), y(ids.size() * static_cast<std::size_t>(n));
