@@ -7,8 +7,8 @@ swapped and the process of --lerobot is killed. Prints a Markdown table.
 scripts/soak.py --seconds 3600            as make soak SECONDS=3600
 
 One server has the page and records, the other one takes orders; each has a robot of each protocol, and probes of its health. Exit code 1
-where an answer is wrong, where an act is lost that was not under way at the process that was killed, or where memory or open files
-grow after the first minute.
+where an answer is wrong, where an act is lost that was not under way at the process that was killed, or where memory, open files or
+threads grow after the first minute.
 """
 
 import argparse
@@ -35,13 +35,13 @@ from attacks.robots import Behaved, Target
 ROOT = Path(__file__).resolve().parents[1]
 PACE = 3  # how many times as long the robots' periods are as in scripts/serve_attacked.py
 SCALE = 2  # sides of their frames over those of the policy's views: the page has all that it keeps within a minute
-WARM, WINDOW = 60, 15  # seconds after which nothing grows, and over which memory and files are looked at
-GROWTH, GROWTH_MIB, FILES, BACK_S, END_S = 1.05, 4, 4, 2, 3  # the bars
+WARM, WINDOW = 60, 15  # seconds after which nothing grows, and over which the medians of memory, files and threads are taken
+GROWTH, GROWTH_MIB, FILES, THREADS, BACK_S, END_S = 1.05, 4, 4, 0, 2, 3  # the bars
 ROBOTS = ("act", "openpi", "gr00t", "lerobot")
 
 
 class Watch(threading.Thread):
-    """Memory and open files of a server and its processes, once a second."""
+    """Memory, open files and threads of a server and its processes, once a second."""
 
     def __init__(self, target):
         super().__init__(daemon=True)
@@ -51,11 +51,15 @@ class Watch(threading.Thread):
 
     def run(self):
         while not self._over.wait(1):
-            files = 0
-            for pid in self._target.processes():
-                with contextlib.suppress(OSError):
-                    files += len(os.listdir(f"/proc/{pid}/fd"))
-            self.samples.append((time.monotonic() - self._start, self._target.memory_mib(), files))
+            counts = [sum(map(self._count, self._target.processes(), itertools.repeat(what))) for what in ("fd", "task")]
+            self.samples.append((time.monotonic() - self._start, self._target.memory_mib(), *counts))
+
+    @staticmethod
+    def _count(pid, what):
+        """None of a process that has ended."""
+        with contextlib.suppress(OSError):
+            return len(os.listdir(f"/proc/{pid}/{what}"))
+        return 0
 
     def stop(self):
         self._over.set()
@@ -63,7 +67,7 @@ class Watch(threading.Thread):
 
     def median(self, begin, end):
         chosen = [sample[1:] for sample in self.samples if begin <= sample[0] <= end]
-        return np.median(chosen, axis=0) if chosen else np.full(2, np.nan)
+        return np.median(chosen, axis=0) if chosen else np.full(3, np.nan)
 
 
 def order(target, **given):
@@ -170,14 +174,14 @@ def report(options, times, robots, watches, disturbances, ends):
         if breaks > most or back > BACK_S * options.loose or not got:
             found.append(f"{server}, {name}: {len(got)} answered, {breaks} breaks of at most {most}, {back:.1f} s")
     warm = min(WARM, options.seconds / 2)
-    print("\n| server | MiB, warm | MiB, at the end | files, warm | files, at the end | end, s | exit status |\n|" + " --- |" * 7)
+    print("\n| server | MiB: warm, at the end | files | threads | end, s | exit status |\n|" + " --- |" * 6)
     for server, watch in watches.items():
         end = watch.samples[-1][0] if watch.samples else 0
-        (memory, files), (memory_after, files_after) = watch.median(warm, warm + WINDOW), watch.median(end - WINDOW, end)
+        (memory, files, threads), after = watch.median(warm, warm + WINDOW), watch.median(end - WINDOW, end)
         end_s, status = ends[server]
-        print(f"| {server} | {memory:.1f} | {memory_after:.1f} | {files:.0f} | {files_after:.0f} | {end_s:.1f} | {status} |")
-        if not memory_after <= GROWTH * memory + GROWTH_MIB or not files_after <= files + FILES:
-            found.append(f"{server}: memory or files grow")
+        print(f"| {server} | {memory:.1f}, {after[0]:.1f} | {files:.0f}, {after[1]:.0f} | {threads:.0f}, {after[2]:.0f} | {end_s:.1f} | {status} |")
+        if not all(after <= (GROWTH * memory + GROWTH_MIB, files + FILES, threads + THREADS)):
+            found.append(f"{server}: memory, files or threads grow")
         if end_s > END_S * options.loose or status:
             found.append(f"{server}: ended in {end_s:.1f} s with status {status}")
     print("\n" + ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in disturbances.done.items()))
