@@ -31,6 +31,7 @@ using nlohmann::ordered_json;
 constexpr std::size_t kMaxLine = 64 << 10;
 constexpr std::size_t kMaxClients = 16;                    // whose orders are on their way
 constexpr auto kPatience = std::chrono::seconds(5);        // from a connection to the end of its order
+constexpr auto kMoment = std::chrono::milliseconds(50);    // of it that a client has however many others connect
 constexpr timeval kReading = {.tv_sec = 2, .tv_usec = 0};  // for a client to take its answer
 constexpr int kLoadNice = 10;                              // loading gives way to the acts of the policies that answer
 
@@ -122,7 +123,7 @@ Status Control::bind() {
       ::bind(listener_, reinterpret_cast<const sockaddr*>(&address), sizeof(address)) != 0)
     return failed(path_, "a path that can be bound");
   ::chmod(path_.c_str(), S_IRUSR | S_IWUSR);
-  if (::listen(listener_, 8) != 0) return failed(path_, "a socket that listens");
+  if (::listen(listener_, SOMAXCONN) != 0) return failed(path_, "a socket that listens");
   return {};
 }
 
@@ -149,9 +150,10 @@ void Control::run() {
   ::setpriority(PRIO_PROCESS, 0, ::getpriority(PRIO_PROCESS, 0) + kLoadNice);  // of this thread, and those it starts
   std::list<Client> clients;
   for (;;) {
-    std::vector<pollfd> wait = {{stopped_, POLLIN, 0}, {listener_, POLLIN, 0}};
+    const bool takes = has_room(clients);
+    std::vector<pollfd> wait = {{stopped_, POLLIN, 0}, {listener_, static_cast<short>(takes ? POLLIN : 0), 0}};
     for (const Client& client : clients) wait.push_back({client.socket, POLLIN, 0});
-    if (::poll(wait.data(), wait.size(), ms_left(clients)) < 0 && errno != EINTR) break;
+    if (::poll(wait.data(), wait.size(), ms_left(clients, takes)) < 0 && errno != EINTR) break;
     if (wait[0].revents != 0) break;
     std::size_t i = 2;
     for (auto client = clients.begin(); client != clients.end(); ++i) {
@@ -165,10 +167,16 @@ void Control::run() {
   ended_.set_value();
 }
 
-/// Until the oldest client has had its time.
-int Control::ms_left(const std::list<Client>& clients) {
+/// Whether another client may come: the oldest, which would be refused for it, has had a moment to send its order.
+bool Control::has_room(const std::list<Client>& clients) {
+  return clients.size() < kMaxClients || Clock::now() >= clients.front().until - kPatience + kMoment;
+}
+
+/// Until the oldest client has had its time, or its moment where others wait for a place.
+int Control::ms_left(const std::list<Client>& clients, bool takes) {
   if (clients.empty()) return -1;
-  const auto left = std::chrono::ceil<std::chrono::milliseconds>(clients.front().until - Clock::now());
+  const auto until = clients.front().until - (takes ? Clock::duration(0) : kPatience - kMoment);
+  const auto left = std::chrono::ceil<std::chrono::milliseconds>(until - Clock::now());
   return static_cast<int>(std::max<std::int64_t>(left.count(), 0));
 }
 
@@ -191,7 +199,9 @@ void Control::answer(Client& client) try {
   const std::unique_ptr<int, void (*)(int*)> closed(&client.socket,
                                                     [](int* open) { ::close(std::exchange(*open, -1)); });
   const std::string line = client.line.substr(0, client.line.find('\n'));
-  const ordered_json given = ordered_json::parse(line, nullptr, false);
+  // Orders are flat. What lies deeper is not kept, since its values would take a hundred times their bytes.
+  const auto is_kept = [](int depth, ordered_json::parse_event_t, const ordered_json&) { return depth < 2; };
+  const ordered_json given = ordered_json::parse(line, is_kept, false);
   try {
     const Result<ordered_json> reply = obey(given);
     write_json(client.socket, reply ? *reply : refused(reply.error()));

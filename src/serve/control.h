@@ -56,7 +56,8 @@ class Control {
       : path_(std::move(path)), server_(server), program_(std::move(program)) {}
   Status bind();
   void run();
-  static int ms_left(const std::list<Client>& clients);
+  static bool has_room(const std::list<Client>& clients);
+  static int ms_left(const std::list<Client>& clients, bool takes);
   void accept(std::list<Client>& clients);
   void answer(Client& client);
   Result<nlohmann::ordered_json> obey(const nlohmann::ordered_json& given);

@@ -5,6 +5,7 @@
 import contextlib
 import json
 import os
+import re
 import shlex
 import signal
 import socket
@@ -12,6 +13,7 @@ import struct
 import subprocess
 import threading
 import time
+from pathlib import Path
 
 import gguf
 import numpy as np
@@ -235,6 +237,50 @@ def test_a_client_that_falls_silent_is_refused_after_its_time(tmp_path):
         begun = time.monotonic()
         assert b'"error"' in peer.recv(4096)
         assert 4 < time.monotonic() - begun < 8
+
+
+def test_a_client_has_a_moment_for_its_order_however_many_others_connect(tmp_path):
+    control = tmp_path / "control"
+    with started("--control", control), contextlib.ExitStack() as peers:
+        begun = time.monotonic()
+        first, *_ = [connected(control, peers) for _ in range(40)]
+        assert b'"error"' in first.recv(4096)  # since others came, long before its time is over
+        assert 0.05 <= time.monotonic() - begun < 4
+
+
+def test_a_client_that_does_not_wait_to_connect_gives_its_order_while_others_are_before_it(tmp_path):
+    control = tmp_path / "control"
+    with started("--control", control) as (process, _), contextlib.ExitStack() as peers:
+        process.send_signal(signal.SIGSTOP)  # takes none, as while it loads a bundle
+        last = [connected(control, peers) for _ in range(60)][-1]
+        last.sendall(b'{"do": "list"}\n')
+        process.send_signal(signal.SIGCONT)
+        assert b'"policies"' in last.recv(4096)
+
+
+def test_an_order_that_is_deep_takes_no_more_memory_than_its_bytes(tmp_path):
+    control = tmp_path / "control"
+    with started("--control", control) as (process, _):
+        assert order(control, "list").returncode == 0
+        before = peak_kib(process)
+        for line in (b"[" * 60_000, b'{"do":' + b"[" * 30_000 + b"]" * 30_000 + b"}"):
+            with contextlib.ExitStack() as peers:
+                peer = connected(control, peers)
+                peer.sendall(line + b"\n")
+                assert b'"error"' in peer.recv(4096)
+        assert peak_kib(process) < before + 2000
+
+
+def connected(path, peers):
+    """A client that asks the system for its connection once, as one with a timeout does."""
+    peer = peers.enter_context(socket.socket(socket.AF_UNIX))
+    peer.settimeout(SECONDS)
+    peer.connect(str(path))
+    return peer
+
+
+def peak_kib(process):
+    return int(re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{process.pid}/status").read_text())[1])
 
 
 @pytest.mark.parametrize("ignored", [False, True])
