@@ -544,8 +544,7 @@ int on_closed(nghttp2_session*, std::int32_t stream, std::uint32_t, void* connec
 class Rpcs::All : public Shared {
  public:
   All(net::Loop& its_loop, int descriptor, const net::ConnectionLimits& its_limits)
-      : Shared{{its_loop, its_limits}},
-        listener_(std::in_place, its_loop.context(), family_of(descriptor), descriptor) {
+      : Shared{{its_loop, its_limits}}, listener_(its_loop.context(), family_of(descriptor), descriptor) {
     if (nghttp2_session_callbacks_new(&callbacks_) != 0 || nghttp2_option_new(&option_) != 0) throw std::bad_alloc();
     nghttp2_session_callbacks_set_on_begin_headers_callback(callbacks_, on_begin_headers);
     nghttp2_session_callbacks_set_on_header_callback(callbacks_, on_header);
@@ -562,12 +561,12 @@ class Rpcs::All : public Shared {
 
   void begin(Handler& its_handler) {
     handler = &its_handler;
-    if (listener_) listener_->listen([this](tcp::socket socket) { add(std::move(socket)); });
+    listener_.listen([this](tcp::socket socket) { add(std::move(socket)); });
     sweeper_.turn([this] { sweep_all(); });
   }
   void stop() {
     is_stopping = true;
-    listener_.reset();
+    listener_.stop();
     const std::map<std::uint64_t, Call*> left = calls;
     for (const auto& [id, call] : left)
       if (calls.contains(id)) call->connection.refuse(*call, {Code::shutting_down, "call", "", "the server stops"});
@@ -600,7 +599,7 @@ class Rpcs::All : public Shared {
     evict_idle();
   }
 
-  std::optional<net::Listener<tcp>> listener_;
+  net::Listener<tcp> listener_;
   net::Sweeper sweeper_{loop};
   std::uint64_t n_connection_ = 0;
   nghttp2_session_callbacks* callbacks_ = nullptr;

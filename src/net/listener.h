@@ -28,13 +28,22 @@ class Listener {
   /// Calls `taken` with each new connection from now on. Call it again after an exception.
   void listen(std::function<void(Socket)> taken) {
     if (!taken_) taken_ = std::move(taken);
-    if (!is_waiting_) accept();
+    if (!is_waiting_ && !is_stopped_) accept();
+  }
+
+  /// Takes no connection any more. Destroy it only when the loop waits no more, which has yet to call what waits here.
+  void stop() {
+    is_stopped_ = true;
+    boost::system::error_code ignored;
+    acceptor_.close(ignored);
+    retry_.cancel();
   }
 
  private:
   void accept() {
     acceptor_.async_accept([this](boost::system::error_code error, Socket socket) {
       is_waiting_ = false;
+      if (is_stopped_) return;
       if (error) return accept_later();
       taken_(std::move(socket));
       accept();
@@ -43,14 +52,17 @@ class Listener {
   }
   void accept_later() {
     retry_.expires_after(std::chrono::milliseconds(100));
-    retry_.async_wait([this](boost::system::error_code) { accept(); });
+    retry_.async_wait([this](boost::system::error_code) {
+      is_waiting_ = false;
+      if (!is_stopped_) accept();
+    });
     is_waiting_ = true;
   }
 
   typename Protocol::acceptor acceptor_;
   boost::asio::steady_timer retry_;
   std::function<void(Socket)> taken_;
-  bool is_waiting_ = false;
+  bool is_waiting_ = false, is_stopped_ = false;
 };
 
 }  // namespace vla::net
