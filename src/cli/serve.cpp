@@ -3,6 +3,7 @@
 #include <fcntl.h>
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <malloc.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -226,8 +227,17 @@ void warn_of_doors_without_keys(const serve::ServerOptions& server, Observabilit
   }
 }
 
+/// Has what large messages took given back to the system as soon as it is freed. By itself malloc keeps up to 64 MB of
+/// it for each thread that took some.
+void give_back_memory() {
+  constexpr int kLarge = 4 << 20;  // bytes; what is smaller is kept for the next act
+  ::mallopt(M_MMAP_THRESHOLD, kLarge);
+  ::mallopt(M_TRIM_THRESHOLD, kLarge);
+}
+
 /// `ready`: whether it came as far as that.
 Status serve(ServeOptions& options, bool& ready) {
+  give_back_memory();
   VLA_CHECK(check_single(options));
   VLA_TRY(const auto bundles, named_bundles(options.bundles));
   options.server.max_message = options.max_message_mb << 20;
