@@ -12,7 +12,7 @@ from server_process import ROOT, VLA, first_in_line
 LOOSE = 25
 
 
-@pytest.mark.parametrize("doors", ["native,metrics", "openpi,gr00t", "process"])
+@pytest.mark.parametrize("doors", ["native,metrics", "openpi,gr00t,control", "lerobot,page", "process"])
 def test_a_server_under_every_attack_at_once_answers_those_who_behave_and_stays_within_its_limits(doors):
     script = [sys.executable, ROOT / "scripts/serve_attacked.py", "--vla", VLA, "--check", "--door", doors]
     script += ["--seconds", "2", "--settle", "2", "--loose", LOOSE, "--patience", "20", *first_in_line()]

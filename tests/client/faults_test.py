@@ -136,17 +136,19 @@ def test_large_acts_that_are_refused_leave_no_memory_behind(case):
     message = wire.Request(protocol_version=1, request_id=1)
     message.act.text = "x" * 30_000_000
     large = Server(case)
-    with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
-        peer.linger, peer.rcvtimeo = 0, SECONDS * 1000
-        peer.connect(large.address)
-        peer.send(request("health"))
-        peer.recv()
-        before = resident_mib(large)
-        for _ in range(12):
-            peer.send(message.SerializeToString())
-            assert wire.Response.FromString(peer.recv()).error.code == 13
-        eventually(lambda: resident_mib(large) < 1.1 * before + 4)  # while the peer stays
-    assert large.stop() == 0
+    try:
+        with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
+            peer.linger, peer.rcvtimeo = 0, SECONDS * 1000
+            peer.connect(large.address)
+            peer.send(request("health"))
+            peer.recv()
+            before = resident_mib(large)
+            for _ in range(12):
+                peer.send(message.SerializeToString())
+                assert wire.Response.FromString(peer.recv()).error.code == 13
+            eventually(lambda: resident_mib(large) < 1.1 * before + 4)  # while the peer stays
+    finally:
+        assert large.stop() == 0
 
 
 def test_a_peer_that_asks_and_never_reads_costs_others_nothing_and_little_memory(server, robot):
