@@ -37,6 +37,7 @@ ROBOTS = ("act", "openpi", "gr00t", "lerobot")
 PROBES = ("health", "healthz", "page", "order")
 # The bars.
 ACT_RATIO, HEALTH_MS, LATE_MS, END_S, BACK_S, KEPT = 2, 50, 20, 3, 2, 1.1
+KEPT_AT_FIRST = 1.25  # of the memory before, within the first minute after an attack
 PAGE_MIB = 96
 
 
@@ -155,7 +156,8 @@ def missed(options, names, quiet, attacked, rest):
     if rest["replaced"] != (is_process and names != ["door_without_memory"]):
         found.append("a process of --lerobot ended" if rest["replaced"] else "no process of --lerobot ended")
     bar("memory at the peak", rest["peak"] - rest["before"], memory, " MiB")
-    bar("memory after", rest["after"], KEPT * rest["before"] + page, " MiB")
+    kept = KEPT if options.settle >= 60 else KEPT_AT_FIRST
+    bar("memory after", rest["after"], kept * rest["before"] + page, " MiB")
     bar("end", rest["end_s"], END_S * loose, " s")
     bar("exit status", abs(rest["status"]), 0)
     if not rest["uploaded"]:
