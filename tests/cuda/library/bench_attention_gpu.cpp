@@ -8,7 +8,6 @@
 
 #include <cmath>
 #include <cstdio>
-#include <cstdlib>
 #include <numeric>
 #include <random>
 
@@ -21,7 +20,6 @@ namespace {
 using namespace vla;
 using namespace vla::cuda;
 using test::cuda::LaunchTimer;
-using test::cuda::Repeats;
 
 struct Size {
   const char* name;
@@ -135,23 +133,6 @@ class Bench {
   std::normal_distribution<float> normal_{0, 1};
 };
 
-Status run(int n_size, Repeats repeats) {
-  VLA_TRY(LaunchTimer timer, LaunchTimer::open(repeats));
-  Bench bench(std::move(timer));
-  for (int i = 0; i < n_size; ++i) VLA_CHECK(bench.run(kSizes[i]));
-  return {};
-}
-
 }  // namespace
 
-/// bench_attention_gpu [SIZES [LAUNCHES [TIMES]]]: the first sizes, all without it; launches of a graph, else 20; how
-/// often it is timed, else 5.
-int main(int n_argument, char** arguments) {
-  const auto number = [&](int i, int otherwise, int most) {
-    return n_argument > i ? std::clamp(std::atoi(arguments[i]), 1, most) : otherwise;
-  };
-  constexpr int kAll = static_cast<int>(std::size(kSizes));
-  const Status status = run(number(1, kAll, kAll), {number(2, 20, 1000), number(3, 5, 1000)});
-  if (!status) fmt::print(stderr, "error: {}\n", status.error().message());
-  return status ? 0 : 1;
-}
+int main(int n_argument, char** arguments) { return vla::test::cuda::run_bench<Bench>(kSizes, n_argument, arguments); }

@@ -10,7 +10,6 @@
 
 #include <algorithm>
 #include <cstdio>
-#include <cstdlib>
 #include <cstring>
 #include <random>
 #include <span>
@@ -27,7 +26,6 @@ namespace {
 using namespace vla;
 using namespace vla::cuda;
 using test::cuda::LaunchTimer;
-using test::cuda::Repeats;
 using Bytes = std::vector<std::byte>;
 
 struct Size {
@@ -225,23 +223,6 @@ class Bench {
   Numbers numbers_;
 };
 
-Status run(int n_size, Repeats repeats) {
-  VLA_TRY(LaunchTimer timer, LaunchTimer::open(repeats));
-  Bench bench(std::move(timer));
-  for (int i = 0; i < n_size; ++i) VLA_CHECK(bench.run(kSizes[i]));
-  return {};
-}
-
 }  // namespace
 
-/// bench_products [SIZES [LAUNCHES [TIMES]]]: the first sizes, all without it; launches of a graph, else 20; how often
-/// it is timed, else 5.
-int main(int n_argument, char** arguments) {
-  const auto number = [&](int i, int otherwise, int most) {
-    return n_argument > i ? std::clamp(std::atoi(arguments[i]), 1, most) : otherwise;
-  };
-  constexpr int kAll = static_cast<int>(std::size(kSizes));
-  const Status status = run(number(1, kAll, kAll), {number(2, 20, 1000), number(3, 5, 1000)});
-  if (!status) fmt::print(stderr, "error: {}\n", status.error().message());
-  return status ? 0 : 1;
-}
+int main(int n_argument, char** arguments) { return vla::test::cuda::run_bench<Bench>(kSizes, n_argument, arguments); }

@@ -2,7 +2,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <fmt/format.h>
+
 #include <algorithm>
+#include <cstdio>
+#include <cstdlib>
 #include <memory>
 #include <span>
 #include <utility>
@@ -70,5 +74,25 @@ class LaunchTimer {
   vla::cuda::Stream stream_;
   Repeats repeats_;
 };
+
+/// The program NAME [SIZES [LAUNCHES [TIMES]]]: Bench::run of the first sizes, all without it; launches of a graph,
+/// else 20; how often it is timed, else 5. Returns its exit code.
+template <class Bench, class Size, std::size_t kN>
+int run_bench(const Size (&sizes)[kN], int n_argument, char** arguments) {
+  const auto number = [&](int i, int otherwise, int most) {
+    return n_argument > i ? std::clamp(std::atoi(arguments[i]), 1, most) : otherwise;
+  };
+  constexpr int kAll = static_cast<int>(kN);
+  const int n_size = number(1, kAll, kAll);
+  const auto run = [&]() -> Status {
+    VLA_TRY(LaunchTimer timer, LaunchTimer::open({number(2, 20, 1000), number(3, 5, 1000)}));
+    Bench bench(std::move(timer));
+    for (int i = 0; i < n_size; ++i) VLA_CHECK(bench.run(sizes[i]));
+    return {};
+  };
+  const Status status = run();
+  if (!status) fmt::print(stderr, "error: {}\n", status.error().message());
+  return status ? 0 : 1;
+}
 
 }  // namespace vla::test::cuda
