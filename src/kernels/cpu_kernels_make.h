@@ -63,7 +63,7 @@ class CpuKernelsMaker {
   };
 
   struct Larger {
-    static VLA_INLINE Float of(Float x, Float w) { return (x > w) | (x != x) ? x : w; }
+    static VLA_INLINE Float of(Float x, Float w) { return ((x > w) | (x != x)) ? x : w; }
     static constexpr bool kBinary = true;
   };
 

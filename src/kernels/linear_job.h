@@ -35,10 +35,10 @@ struct LinearJob {
     const float *weight = nullptr, *bias = nullptr;
     float eps = 0;
 
-    /// Row x of n elements as the product reads it; `room` receives the norm if there is one.
-    VLA_INLINE const float* operator()(const float* x, std::int64_t n, float* room) const {
-      if (run == nullptr) return x;
-      run(x, weight, bias, eps, room, n);
+    /// A row of n elements as the product reads it; `room` receives the norm if there is one.
+    VLA_INLINE const float* operator()(const float* row, std::int64_t n, float* room) const {
+      if (run == nullptr) return row;
+      run(row, weight, bias, eps, room, n);
       return room;
     }
   };

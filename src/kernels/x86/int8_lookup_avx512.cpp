@@ -209,8 +209,8 @@ class LookupLoop {
 
   struct Tile {
     using V = kernels::V;
-    static constexpr int kRows = kernels::kRows, kColumns = kernels::kColumns;
-    static constexpr bool kEven = false;
+    [[maybe_unused]] static constexpr int kRows = kernels::kRows;
+    static constexpr int kColumns = kernels::kColumns;
   };
   using Stripes = LinearStripes<Tile>;
 
