@@ -3,6 +3,8 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
+#include <functional>
 #include <list>
 #include <map>
 #include <optional>
@@ -25,6 +27,11 @@ namespace vla::serve {
 /// came long before them, or after. Where the queue is full, the peer that has most in it gives way to one that has
 /// less, and then within the peer the generation that has most.
 ///
+/// Before whoever's turn it is comes a peer, or in a crowd a generation, that connected earlier and had fewer of the
+/// last `kRecent` turns: robots that were there before a flood, and that ask for less than half of what the server
+/// computes, wait for the act that is being computed, and for none of the flood's that wait. Those who came later
+/// cannot do so, and nobody waits for more than `kRecent` turns beyond its place in line.
+///
 /// `Job` has `client` (std::string), `share` (net::Share), `deadline` (std::optional<Clock::time_point>) and `size`
 /// (bytes). The queue knows no clock and takes no lock.
 template <class Job>
@@ -34,12 +41,13 @@ class Queue {
     std::size_t jobs, bytes;
   };
   static constexpr std::size_t kCrowd = 8;
+  static constexpr std::size_t kRecent = 32;
   explicit Queue(Limits limits) : limits_(limits) {}
 
   std::size_t size() const { return line_.size(); }
   bool empty() const { return line_.empty(); }
   /// Whether more than `kCrowd` clients of the next peer wait.
-  bool is_crowded() const { return !turns_.empty() && n_of(turns_.front().group) > kCrowd; }
+  bool is_crowded() const { return !turns_.empty() && n_of(next_peer()->group) > kCrowd; }
 
   /// Queues a job. Jobs that do not wait afterwards are returned: `superseded` is the client's older job, `refused` the
   /// given job or the last ones of a peer that has more in the queue.
@@ -90,11 +98,13 @@ class Queue {
   /// The client that waits longest, of the peer whose turn it is.
   std::optional<Job> pop() {
     if (line_.empty()) return std::nullopt;
-    const bool is_crowd = is_crowded();
-    turns_.splice(turns_.end(), turns_, turns_.begin());
+    turns_.splice(turns_.end(), turns_, next_peer());
     Turn& turn = turns_.back();
-    if (is_crowd) return take(next_generation(turn));
-    return take(find([&](const Job& job) { return job.share.group == turn.group; }));
+    const bool is_crowd = n_of(turn.group) > kCrowd;
+    const Place next =
+        is_crowd ? next_generation(turn) : find([&](const Job& job) { return job.share.group == turn.group; });
+    recent_[n_popped_++ % kRecent] = {hash_of(turn.group), next->share.since};
+    return take(next);
   }
 
  private:
@@ -103,6 +113,37 @@ class Queue {
     std::string group;
     Clock::time_point last = {};  // in a crowd: arrival of the connection that had its last turn
   };
+
+  /// A turn that was had; of the group by its hash, so that it takes no memory.
+  struct Recent {
+    std::size_t group = 0;
+    Clock::time_point since = {};
+  };
+
+  static std::size_t hash_of(const std::string& group) { return std::hash<std::string>()(group); }
+
+  /// How many of the last turns a group had.
+  std::size_t n_recent_of(const std::string& group) const {
+    return static_cast<std::size_t>(std::count_if(
+        recent_.begin(), recent_.end(), [hash = hash_of(group)](const Recent& turn) { return turn.group == hash; }));
+  }
+
+  /// When the oldest connection of a group came that waits.
+  Clock::time_point oldest_of(const std::string& group) const {
+    Clock::time_point oldest = Clock::time_point::max();
+    for (const Job& job : line_)
+      if (job.share.group == group) oldest = std::min(oldest, job.share.since);
+    return oldest;
+  }
+
+  /// The first in line, or one that came before it and had fewer turns of late.
+  typename std::list<Turn>::const_iterator next_peer() const {
+    auto next = turns_.begin();
+    for (auto turn = std::next(next); turn != turns_.end(); ++turn)
+      if (oldest_of(turn->group) < oldest_of(next->group) && n_recent_of(turn->group) < n_recent_of(next->group))
+        next = turn;
+    return next;
+  }
 
   template <class Wanted>
   Place find(Wanted wanted) {
@@ -133,7 +174,8 @@ class Queue {
   }
 
   /// In a crowd: the group's first job of the next older generation after the one that had the last turn; after the
-  /// oldest comes the newest. Later arrivals are newer and delay nobody.
+  /// oldest comes the newest. Later arrivals are newer and delay nobody. An older generation that had fewer turns of
+  /// late comes first.
   Place next_generation(Turn& turn) {
     const Generations generations = generations_of(turn.group, {turn.last});  // that connection may have left the queue
     const auto distance = [&](const Job& job) {
@@ -141,8 +183,15 @@ class Queue {
       return job.share.group == turn.group ? (generations.of(turn.last) + n - generations.of(job.share.since) - 1) % n
                                            : n;
     };
-    const auto next = std::min_element(line_.begin(), line_.end(),
-                                       [&](const Job& a, const Job& b) { return distance(a) < distance(b); });
+    auto next = std::min_element(line_.begin(), line_.end(),
+                                 [&](const Job& a, const Job& b) { return distance(a) < distance(b); });
+    std::vector<std::size_t> n_turn(generations.size());
+    for (const Recent& had : recent_)
+      if (had.group == hash_of(turn.group)) ++n_turn[generations.of(had.since)];
+    for (auto job = line_.begin(); job != line_.end(); ++job) {
+      const std::size_t own = generations.of(job->share.since), other = generations.of(next->share.since);
+      if (job->share.group == turn.group && own < other && n_turn[own] < n_turn[other]) next = job;
+    }
     turn.last = next->share.since;
     return next;
   }
@@ -189,6 +238,8 @@ class Queue {
   std::list<Job> line_;    // at most as many clients as fit: a linear search costs nothing beside an act
   std::list<Turn> turns_;  // peers with a queued job, the next one first
   std::size_t bytes_ = 0;
+  std::array<Recent, kRecent> recent_;  // the last turns, in a ring
+  std::size_t n_popped_ = 0;
 };
 
 }  // namespace vla::serve

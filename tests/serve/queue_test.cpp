@@ -83,6 +83,41 @@ TEST_CASE("a peer of seventy connections gets as many turns as a peer of one") {
   }
 }
 
+namespace {
+
+/// Whose the next turns are, as letters, where a flood of 70 connections always waits.
+std::string turns(Queue<Item>& queue, int n, const std::string& flood, const std::string& robots = "", int since = 0) {
+  std::string out;
+  for (int i = 0; i < 4 && !robots.empty(); ++i) queue.push({"r" + std::to_string(i), i, 1, {}, {robots, at(since)}});
+  for (int turn = 0; turn < n; ++turn) {
+    for (int i = 0; i < 70; ++i) queue.push({"f" + std::to_string(i), i, 1, {}, {flood, at(5000 + i)}});
+    out += queue.pop()->client[0];
+  }
+  return out;
+}
+
+}  // namespace
+
+TEST_CASE("robots that came before a flood, and ask for less than half of the turns, wait for none of its acts") {
+  for (const std::string flood : {"another", "robots"}) {
+    CAPTURE(flood);
+    Queue<Item> queue(kRoom);
+    turns(queue, 40, flood);
+    for (int round = 0; round < 50; ++round) CHECK(turns(queue, 10, flood, "robots", 0) == "rrrrffffff");
+    for (int round = 0; round < 5; ++round)
+      CHECK(turns(queue, 10, flood, "robots", 9000).find("rr") == std::string::npos);
+  }
+}
+
+TEST_CASE("who came first gets no more than half of the turns, nor many in a row") {
+  Queue<Item> queue(kRoom);
+  turns(queue, 40, "flood");
+  std::string out;
+  for (int turn = 0; turn < 100; ++turn) out += turns(queue, 1, "flood", "robots", 0);
+  CHECK(out.find_first_not_of('r') == Queue<Item>::kRecent / 2);
+  CHECK(out.substr(Queue<Item>::kRecent).find("rr") == std::string::npos);
+}
+
 TEST_CASE("in a crowd of one peer, a connection of another age gets every second turn") {
   for (const int since : {0, 9900}) {
     Queue<Item> queue(kRoom);
