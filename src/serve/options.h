@@ -8,6 +8,8 @@
 
 namespace vla::serve {
 
+constexpr std::size_t kMostText = 1 << 20;  // bytes of an instruction, and so of --max-text
+
 struct ServerOptions {
   std::vector<std::string> bind = {"tcp://127.0.0.1:5555"};
   bool insecure = false;                    // an address that others can reach may be bound without keys

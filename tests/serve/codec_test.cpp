@@ -152,6 +152,19 @@ TEST_CASE("what is over a limit is told apart from what is wrong") {
   check_refused(act, Code::too_large, "view \"jpeg\"");
 }
 
+TEST_CASE("text has its limit before its bytes are looked at") {
+  const auto refused = [](const std::string& more, Code code, const std::string& where) {
+    const auto request = decode(full_act().SerializeAsString() + more);
+    REQUIRE_FALSE(request.ok());
+    CHECK(request.error().code == code);
+    CHECK(request.error().where == where);
+  };
+  const std::string odd(100, '\xff');  // no text
+  refused(bytes_field(v1::Act::kTextFieldNumber, odd), Code::too_large, "instruction");
+  refused(bytes_field(v1::Act::kTextFieldNumber, "\xff"), Code::bad_request, "act");
+  refused(bytes_field(v1::Act::kEmbodimentFieldNumber, odd), Code::bad_request, "act");
+}
+
 TEST_CASE("images are counted together before any is decoded") {
   v1::Act act = full_act();
   act.mutable_views(0)->mutable_rgb()->set_width(99);

@@ -100,6 +100,19 @@ TEST_CASE("what a message announces takes no memory before it came") {
   refusal(std::string("\xdb\xff\xff\xff\xff", 5));
 }
 
+TEST_CASE("texts are bounded together, and each before its bytes are looked at") {
+  const auto list_of = [](std::size_t n, char letter) {
+    const std::string text = std::string("\xdb\0\x10\0\0", 5) + std::string(1 << 20, letter);
+    std::string message(1, static_cast<char>(0x90 + n));
+    for (std::size_t i = 0; i < n; ++i) message += text;
+    return message;
+  };
+  CHECK(msgpack::read(bytes_of(list_of(2, 'x'))).ok());
+  CHECK(refusal(list_of(3, 'x')).expected == "fewer bytes of text");
+  CHECK(refusal(std::string("\xdb\0\x20\0\1", 5) + std::string((2 << 20) + 1, '\xff')).expected ==
+        "fewer bytes of text");
+}
+
 TEST_CASE("what the clients' packages write is read, in every framing of arrays") {
   int n_act = 0;
   for (const auto& file : std::filesystem::directory_iterator(test::source_path("tests/fuzz/regressions/openpi"))) {

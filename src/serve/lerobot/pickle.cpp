@@ -222,6 +222,8 @@ class Reader {
     VLA_TRY(const std::uint64_t size, number(n_size));
     const Taken taken = take(size);
     if (!taken.ok()) return cut_off();
+    if (type == Type::text && (n_text_ += size) > kMaxTexts)
+      return bad(fmt::format("at most {} bytes of text", kMaxTexts), "more");
     if (type == Type::text && unicode::valid_prefix(taken.bytes) < size) return bad("text in UTF-8", "other bytes");
     return push({.type = type, .data = taken.bytes});
   }
@@ -381,6 +383,7 @@ class Reader {
   Pickle out_;
   std::vector<Value*> stack_, memo_;
   std::vector<std::size_t> marks_;
+  std::size_t n_text_ = 0;  // bytes
 };
 
 Result<Pickle> Pickle::read(std::span<const std::byte> message) {

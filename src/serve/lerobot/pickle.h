@@ -11,6 +11,7 @@
 
 #include "base/result.h"
 #include "serve/array.h"
+#include "serve/options.h"
 
 namespace vla::pickle {
 
@@ -32,8 +33,9 @@ struct Value {
   const Value* find(std::string_view key) const;
 };
 
-constexpr std::size_t kMaxSteps = 1 << 14;  // opcodes of a message
-constexpr std::size_t kMaxMarks = 64;       // containers that are open at once
+constexpr std::size_t kMaxSteps = 1 << 14;               // opcodes of a message
+constexpr std::size_t kMaxMarks = 64;                    // containers that are open at once
+constexpr std::size_t kMaxTexts = 2 * serve::kMostText;  // bytes of all of them: an instruction, and names
 
 /// A message that Python's pickle wrote, protocol 2 to 5. Nothing of it is executed: names of classes and functions are
 /// compared with the few that LeRobot's clients and NumPy's arrays use, and stand for data. Errors: bad_request for any

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "serve/msgpack/array.h"
 
+#include <fmt/format.h>
+
 #include "base/npy.h"
 #include "processor/unicode.h"
 
@@ -89,6 +91,9 @@ Result<std::vector<float>> floats_of(const Value& value, const std::string& wher
 Result<std::string> text_of(const Value& value, const std::string& where) {
   if (value.is_text()) return std::string(value.data);
   if (value.type == Type::bytes) {
+    if (value.data.size() > serve::kMostText)
+      return Error{Code::too_large, where, fmt::format("at most {} bytes", serve::kMostText),
+                   fmt::format("{} bytes", value.data.size())};
     if (unicode::valid_prefix(value.data) < value.data.size()) return bad(where, "text in UTF-8", "other bytes");
     return std::string(value.data);
   }

@@ -37,6 +37,7 @@ class Reader : public ::msgpack::null_visitor {
   bool visit_float64(double v) { return add({.type = Type::real, .real = v}); }
   bool visit_str(const char* v, std::uint32_t size) {
     const std::string_view text(v, size);
+    if ((n_text_ += size) > kMaxTexts) return refuse("fewer bytes of text", fmt::format("more than {}", kMaxTexts));
     if (unicode::valid_prefix(text) < size) return refuse("text in UTF-8", "other bytes");
     return add({.type = Type::text, .data = text});
   }
@@ -86,7 +87,7 @@ class Reader : public ::msgpack::null_visitor {
   }
 
   std::vector<Value*> open_;  // open lists and maps, outermost first; each is the last item of the one before
-  std::size_t n_value_ = 0;
+  std::size_t n_value_ = 0, n_text_ = 0;
 };
 
 }  // namespace

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "base/result.h"
+#include "serve/options.h"
 
 namespace vla::msgpack {
 
@@ -32,9 +33,10 @@ struct Value {
 
 constexpr std::size_t kMaxValues = 4096;  // limits of a message; an array counts as bytes
 constexpr std::size_t kMaxDepth = 8;
+constexpr std::size_t kMaxTexts = 2 * serve::kMostText;  // bytes of all of them: an instruction, and names
 
 /// Parses one whole message. Errors: bad_request if it is truncated, has bytes left over, an extension type, a key that
-/// is not text or bytes or occurs twice, text that is not UTF-8, or more values or levels than the limits.
+/// is not text or bytes or occurs twice, text that is not UTF-8, or more values, levels or text than the limits.
 Result<Value> read(std::span<const std::byte> message);
 
 }  // namespace vla::msgpack

@@ -38,20 +38,25 @@ std::string_view text_of(std::span<const std::byte> bytes) {
   return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
 }
 
-/// The fields of a message in the order of their numbers, from 1: v varint, u one of 32 bits, b bytes, t text, f floats
-/// (packed or not), d double, and a digit for a message, the index of its own row.
-constexpr std::array<const char*, 9> kFields = {
-    "15t3vvv7tt",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover, embodiment,
-                   // policy
-    "t2bb4",       // 1 View: name, rgb, jpeg, png, absent
-    "uub",         // 2 RawRgb: width, height, rows
-    "uuf",         // 3 Noise: horizon, d_action, values
-    "",            // 4 Absent
-    "tf",          // 5 State: name, values
-    "uutt",        // 6 Hello: min_version, max_version, client_name, client_version
-    "uufutd",      // 7 Leftover: n_row, d_action, values, delay, schedule, max_guidance
-    "t",           // 8 Describe: policy
+struct Row {
+  std::string_view types;
+  const char* names = "";  // where its names are, for errors
 };
+
+/// The fields of a message in the order of their numbers, from 1: v varint, u one of 32 bits, b bytes, t text, n a
+/// name, f floats (packed or not), d double, and a digit for a message, the index of its own row.
+constexpr std::array<Row, 9> kFields = {{
+    {"15t3vvv7nn", "embodiment"},  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover,
+                                   // embodiment, policy
+    {"n2bb4", "views"},            // 1 View: name, rgb, jpeg, png, absent
+    {"uub"},                       // 2 RawRgb: width, height, rows
+    {"uuf"},                       // 3 Noise: horizon, d_action, values
+    {""},                          // 4 Absent
+    {"nf", "states"},              // 5 State: name, values
+    {"uutt"},                      // 6 Hello: min_version, max_version, client_name, client_version
+    {"uufund", "leftover.schedule"},  // 7 Leftover: n_row, d_action, values, delay, schedule, max_guidance
+    {"n", "policy"},                  // 8 Describe: policy
+}};
 
 /// Whether a field that was read is encoded as its type says.
 bool fits(const Fields& field, char type) {
@@ -61,34 +66,41 @@ bool fits(const Fields& field, char type) {
   return field.type == 'b' || (type == 'f' && field.type == 'f');
 }
 
+/// Text has its limit before anybody looks at it.
+Status check_size(const Fields& text, bool is_name, const char* names, std::size_t max_text) {
+  const std::size_t most = is_name ? kMaxName : max_text, size = text.value.size();
+  if (size <= most) return {};
+  return too_large(is_name ? names : "instruction", fmt::format("{}at most {} bytes", is_name ? "names of " : "", most),
+                   fmt::format("{} bytes", size));
+}
+
 /// Whether a message holds known fields only, each in its own encoding. Protobuf would skip any other, and what it
 /// skipped might have changed the answer: a seed in a wrong encoding would become a fresh one.
-Status check_fields(std::span<const std::byte> bytes, std::size_t row, const char* where) {
-  const std::string_view types = kFields[row];
+Status check_fields(std::span<const std::byte> bytes, std::size_t row, const char* where, std::size_t max_text) {
+  const auto& [types, names] = kFields[row];
   for (Fields field(bytes, where);;) {
     VLA_TRY(const bool more, field.next());
     if (!more) return {};
     const auto index = static_cast<std::size_t>(field.number) - 1;
     if (index >= types.size() || !fits(field, types[index])) return field.unknown();
     const char type = types[index];
-    if (type == 't' && unicode::valid_prefix(text_of(field.value)) < field.value.size())
-      return not_a_request(where, "text in UTF-8", fmt::format("field {} with other bytes", field.number));
-    if (type >= '0' && type <= '9') VLA_CHECK(check_fields(field.value, static_cast<std::size_t>(type - '0'), where));
+    if (type == 't' || type == 'n') {
+      VLA_CHECK(check_size(field, type == 'n', names, max_text));
+      if (unicode::valid_prefix(text_of(field.value)) < field.value.size())
+        return not_a_request(where, "text in UTF-8", fmt::format("field {} with other bytes", field.number));
+    }
+    if (type >= '0' && type <= '9')
+      VLA_CHECK(check_fields(field.value, static_cast<std::size_t>(type - '0'), where, max_text));
   }
 }
 
 template <class Message>
-Result<Message> parse(std::span<const std::byte> bytes, std::size_t row, const char* where) {
-  VLA_CHECK(check_fields(bytes, row, where));
+Result<Message> parse(std::span<const std::byte> bytes, std::size_t row, const char* where, std::size_t max_text = 0) {
+  VLA_CHECK(check_fields(bytes, row, where, max_text));
   Message message;
   if (!message.ParseFromArray(bytes.data(), static_cast<int>(bytes.size())))
     return not_a_request(where, "a serialized message", "bytes that do not parse as one");
   return message;
-}
-
-Status check_name(const std::string& name, const char* where) {
-  if (name.size() <= kMaxName) return {};
-  return too_large(where, fmt::format("names of at most {} bytes", kMaxName), fmt::format("{} bytes", name.size()));
 }
 
 ImageLimits image_limits(const ActLimits& limits) { return {limits.max_pixels, Code::too_large}; }
@@ -152,7 +164,6 @@ Status decode_views(const v1::Act& act, const ActLimits& limits, const FeatureNa
     return too_large("views", fmt::format("at most {} views", limits.max_views), std::to_string(act.views_size()));
   ActLimits left = limits;
   for (const v1::View& view : act.views()) {  // all of them before any image is decoded
-    VLA_CHECK(check_name(view.name(), "views"));
     VLA_CHECK(check_cost(view, features.place(view.name()), left));
   }
   for (const v1::View& view : act.views()) {
@@ -166,7 +177,6 @@ Status decode_views(const v1::Act& act, const ActLimits& limits, const FeatureNa
 
 Status decode_states(const v1::Act& act, const FeatureNames& features, Observation& observation) {
   for (const v1::State& state : act.states()) {
-    VLA_CHECK(check_name(state.name(), "states"));
     std::vector<float> values(state.values().begin(), state.values().end());
     if (!observation.states.emplace(state.name(), std::move(values)).second)
       return bad_observation(features.place(state.name()), "each state once", "a second one");
@@ -200,7 +210,6 @@ Status decode_leftover(const v1::Act& act, const ActLimits& limits, ActRequest& 
     return bad_observation("leftover", fmt::format("at most {} rows of {}", horizon, d_action),
                            fmt::format("{} rows of {}, {} numbers, a delay of {}", given.n_row(), given.d_action(),
                                        given.values_size(), given.delay()));
-  VLA_CHECK(check_name(given.schedule(), "leftover.schedule"));
   request.leftover = {
       {given.values().begin(), given.values().end()}, static_cast<int>(given.delay()), given.schedule(), {}};
   if (given.has_max_guidance()) request.leftover->max_guidance = given.max_guidance();
@@ -211,10 +220,7 @@ Status decode_leftover(const v1::Act& act, const ActLimits& limits, ActRequest& 
 
 Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits& limits, const FeatureNames& views,
                               const FeatureNames& states) {
-  VLA_TRY(v1::Act act, parse<v1::Act>(bytes, 0, "act"));
-  if (act.text().size() > limits.max_text)
-    return too_large("instruction", fmt::format("at most {} bytes", limits.max_text),
-                     fmt::format("{} bytes", act.text().size()));
+  VLA_TRY(v1::Act act, parse<v1::Act>(bytes, 0, "act", limits.max_text));
   ActRequest request;
   request.observation.text = std::move(*act.mutable_text());
   request.observation.embodiment = std::move(*act.mutable_embodiment());
@@ -242,7 +248,6 @@ Result<Frame> seen(const v1::Act& act, int view, const Engine& engine, std::int6
 
 Result<std::string> read_describe(std::span<const std::byte> describe) {
   VLA_TRY(v1::Describe parsed, parse<v1::Describe>(describe, 8, "describe"));
-  VLA_CHECK(check_name(parsed.policy(), "policy"));
   return std::move(*parsed.mutable_policy());
 }
 
@@ -252,8 +257,8 @@ Result<std::string> named_embodiment(std::span<const std::byte> act) {
     VLA_TRY(const bool more, field.next());
     if (!more) return tag;
     if (field.number != v1::Act::kEmbodimentFieldNumber || field.type != 'b') continue;
+    VLA_CHECK(check_size(field, true, "embodiment", 0));
     tag = text_of(field.value);
-    VLA_CHECK(check_name(tag, "embodiment"));
   }
 }
 
@@ -261,7 +266,7 @@ Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes, std::strin
   constexpr std::size_t kMaxHello = 4096, kMaxName = 64;
   if (bytes.size() > kMaxHello)
     return too_large("hello", fmt::format("at most {} bytes", kMaxHello), fmt::format("{} bytes", bytes.size()));
-  VLA_TRY(const v1::Hello hello, parse<v1::Hello>(bytes, 6, "hello"));
+  VLA_TRY(const v1::Hello hello, parse<v1::Hello>(bytes, 6, "hello", kMaxHello));
   if (hello.min_version() < 1 || hello.max_version() < hello.min_version())
     return Error{Code::bad_request, "hello", "versions with 1 <= min_version <= max_version",
                  fmt::format("{} to {}", hello.min_version(), hello.max_version())};
