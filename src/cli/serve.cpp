@@ -3,7 +3,6 @@
 #include <fcntl.h>
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <malloc.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -18,6 +17,7 @@
 #include <map>
 
 #include "cli/commands.h"
+#include "cli/kept_memory.h"
 #include "cli/observability.h"
 #include "cli/say.h"
 #include "processor/constant_actions.h"
@@ -227,17 +227,9 @@ void warn_of_doors_without_keys(const serve::ServerOptions& server, Observabilit
   }
 }
 
-/// Has what large messages took given back to the system as soon as it is freed. By itself malloc keeps up to 64 MB of
-/// it for each thread that took some.
-void give_back_memory() {
-  constexpr int kLarge = 4 << 20;  // bytes; what is smaller is kept for the next act
-  ::mallopt(M_MMAP_THRESHOLD, kLarge);
-  ::mallopt(M_TRIM_THRESHOLD, kLarge);
-}
-
 /// `ready`: whether it came as far as that.
 Status serve(ServeOptions& options, bool& ready) {
-  give_back_memory();
+  KeptMemory memory;
   VLA_CHECK(check_single(options));
   VLA_TRY(const auto bundles, named_bundles(options.bundles));
   options.server.max_message = options.max_message_mb << 20;
@@ -286,7 +278,9 @@ Status serve(ServeOptions& options, bool& ready) {
   policies.clear();  // the server's alone, so that one that is taken away is gone
   if (control) VLA_CHECK(control->start());
   ready = true;
-  const Status status = server->run(observability->observers());
+  std::vector<serve::Observer*> observers = observability->observers();
+  observers.push_back(&memory);
+  const Status status = server->run(observers);
   observability->ended(status);
   if (control && !control->stop(kLoadPatience) && status) end_while_loading(observability);
   return status;
@@ -365,7 +359,7 @@ Command add_serve(CLI::App& app) {
       ->check(CLI::Range(1, 1 << 28))
       ->capture_default_str();
   command->add_option("--max-text", server.max_text, "Longest instruction, in bytes")
-      ->check(CLI::Range(1, 1 << 20))
+      ->check(CLI::Range(1, static_cast<int>(serve::kMostText)))
       ->capture_default_str();
   command->add_option("--queue", server.max_queue, "Acts that may wait, one for each client; further ones are refused")
       ->check(CLI::Range(1, 4096))

@@ -3,10 +3,12 @@
 #pragma once
 
 #include <fmt/format.h>
+#include <malloc.h>
 
 #include <algorithm>
 #include <map>
 #include <memory>
+#include <utility>
 
 #include "net/eviction.h"
 #include "net/loop.h"
@@ -27,11 +29,21 @@ struct Connections {
   ConnectionLimits limits;
   std::map<std::uint64_t, std::shared_ptr<Connection>> connections = {};  // oldest first
   std::size_t n_held = 0;                                                 // bytes in incomplete requests
+  bool has_freed = false;  // since the last sweep: requests or answers of connections that have ended
 
   /// Null if it has ended. The pointer keeps it alive while it is used.
   std::shared_ptr<Connection> find(std::uint64_t connection) const {
     const auto found = connections.find(connection);
     return found == connections.end() ? nullptr : found->second;
+  }
+  /// Sends it an answer by `send`. If it has ended, the request is freed now.
+  template <class Send>
+  void answer(std::uint64_t connection, Send send) {
+    if (const auto found = find(connection)) {
+      send(*found);
+    } else {
+      has_freed = true;
+    }
   }
   /// Drops connections until at most `limits.connections` are left.
   void evict_idle() {
@@ -53,10 +65,11 @@ struct Connections {
   bool has_answers() const {
     return std::any_of(connections.begin(), connections.end(), [](const auto& c) { return c.second->has_answers(); });
   }
-  /// Calls `sweep` on each connection, which may end it.
+  /// Calls `sweep` on each connection, which may end it. Returns memory that a flood took to the system.
   void sweep_all() {
     const auto all = connections;
     for (const auto& [id, connection] : all) connection->sweep();
+    if (std::exchange(has_freed, false)) ::malloc_trim(0);
   }
   void close_all() {
     while (!connections.empty()) connections.begin()->second->close();

@@ -3,6 +3,7 @@
 #include "observe/page.h"
 
 #include <fmt/format.h>
+#include <malloc.h>
 
 #include <charconv>
 #include <nlohmann/json.hpp>
@@ -330,11 +331,14 @@ void Page::keep(const std::shared_ptr<Act>& act, std::span<const std::byte> in, 
   act->size = kRoom;
   for (const std::string* text : {&act->client, &act->name, &act->code, &act->in, &act->out})
     act->size += on_heap(*text);
-  const std::lock_guard lock(mutex_);
-  acts_.push_back(act);
-  act->id = ++n_act_;
-  bytes_ += act->size;
-  for (; bytes_ > kMaxBytes; acts_.pop_front()) bytes_ -= acts_.front()->size;
+  {
+    const std::lock_guard lock(mutex_);
+    acts_.push_back(act);
+    act->id = ++n_act_;
+    bytes_ += act->size;
+    for (; bytes_ > kMaxBytes; acts_.pop_front()) bytes_ -= acts_.front()->size;
+  }
+  if (act->size > kMaxBytes / 16) ::malloc_trim(0);  // many small ones went for it, whose memory it cannot have
 }
 
 bool Page::may_ask(const std::string& query) const {

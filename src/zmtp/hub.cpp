@@ -4,7 +4,6 @@
 
 #include <fmt/format.h>
 #include <ifaddrs.h>
-#include <malloc.h>
 #include <net/if.h>
 #include <unistd.h>
 
@@ -118,7 +117,6 @@ class Connection;
 struct Shared : net::Connections<Connection> {
   const CurveKeys* keys;
   Hub::Handler* handler = nullptr;
-  bool has_freed = false;  // since the last sweep: what connections that closed had sent, or had not read
 };
 
 class Connection : public std::enable_shared_from_this<Connection> {
@@ -295,11 +293,11 @@ class Hub::Sockets : public Shared {
     handler = &its_handler;
     for (auto& listener : tcps_) listener.listen([this](tcp::socket socket) { add(std::move(socket)); });
     for (auto& listener : locals_) listener.listen([this](Local::socket socket) { add(std::move(socket)); });
-    sweeper_.turn([this] { sweep(); });
+    sweeper_.turn([this] { sweep_all(); });
   }
 
   void send(std::uint64_t connection, std::string_view response, bool delimiter) {
-    if (const auto found = find(connection)) found->answer(response, delimiter);
+    answer(connection, [&](Connection& to) { to.answer(response, delimiter); });
   }
 
  private:
@@ -311,11 +309,6 @@ class Hub::Sockets : public Shared {
     connections.emplace(n_connection_, connection);
     connection->start();
     evict_idle();
-  }
-
-  void sweep() {
-    sweep_all();
-    if (std::exchange(has_freed, false)) ::malloc_trim(0);  // returns memory that a flood took to the system
   }
 
   std::list<net::Listener<tcp>> tcps_;

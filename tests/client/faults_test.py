@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import hostile
+import numpy as np
 import pytest
 import zmq
 from server_process import SECONDS, Robot, Server, frames
@@ -38,6 +39,11 @@ def undisturbed(robot, quiet):
 def resident_mib(server):
     status = Path(f"/proc/{server.process.pid}/status").read_text()
     return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024
+
+
+def new_pages(server):
+    """That the process has touched so far."""
+    return int(Path(f"/proc/{server.process.pid}/stat").read_text().rpartition(")")[2].split()[7])
 
 
 def n_files(server):
@@ -149,6 +155,24 @@ def test_large_acts_that_are_refused_leave_no_memory_behind(case):
             eventually(lambda: resident_mib(large) < 1.1 * before + 4)  # while the peer stays
     finally:
         assert large.stop() == 0
+
+
+def test_acts_of_large_frames_take_no_new_pages(case):
+    large = Server(case)
+    try:
+        with vla_cpp.Client(large.address, timeout=SECONDS) as client:
+            act = {
+                "images": {view.name: np.zeros((1300, 1300, 3), np.uint8) for view in client.spec.views},
+                "state": {state.name: np.zeros(state.width, np.float32) for state in client.spec.states},
+            }
+            taken = []
+            for _ in range(8):
+                before = new_pages(large)
+                client.act(**act, text="go", seed=1)
+                taken.append(new_pages(large) - before)
+    finally:
+        assert large.stop() == 0
+    assert min(taken[2:]) < 100 < max(taken), taken  # of the first one's thousands
 
 
 def test_a_peer_that_asks_and_never_reads_costs_others_nothing_and_little_memory(server, robot):

@@ -95,6 +95,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     error_code ignored;
     stream_.next_layer().shutdown(tcp::socket::shutdown_both, ignored);
     stream_.next_layer().close(ignored);
+    shared_.has_freed = shared_.has_freed || n_held_ > 0 || buffer_.size() > 0;
     hold(0);
     shared_.connections.erase(peer_.connection);
   }
@@ -290,10 +291,10 @@ Result<std::string> Sockets::bind(const std::string& address, const char* option
 }
 void Sockets::begin(Handler& handler) { all_->begin(handler); }
 void Sockets::send(std::uint64_t connection, std::string message) {
-  if (const auto found = all_->find(connection)) found->send(std::move(message), false);
+  all_->answer(connection, [&](Connection& to) { to.send(std::move(message), false); });
 }
 void Sockets::fail(std::uint64_t connection, std::string text) {
-  if (const auto found = all_->find(connection)) found->send(std::move(text), true);
+  all_->answer(connection, [&](Connection& to) { to.send(std::move(text), true); });
 }
 void Sockets::drop(std::uint64_t connection) noexcept try {
   if (const auto found = all_->find(connection)) found->drop("memory", "none for its request");
