@@ -195,7 +195,9 @@ def test_the_backbones_image_processor_resizes_what_its_limits_do_not_hold(conve
     tiny.images.update(min_pixels=least, max_pixels=most)
     bundle = convert(converter, tiny, camera_size="40x30")
     resize = {"op": "resize", "width": width, "height": height, "filter": "torch_bicubic_16bit"}
-    assert recipe(bundle)["image"][3:5] == [resize, {"op": "size", "width": width, "height": height}]
+    # 40x30 -> 16x12 -> crop 14x11 -> 15x12
+    expected = [{"op": "expect_size", "width": 15, "height": 12}, resize, {"op": "size", "width": width, "height": height}]
+    assert recipe(bundle)["image"][3:6] == expected
     assert (bundle.keys["vision.image_width"], bundle.keys["vision.image_height"]) == (width, height)
 
 
@@ -203,6 +205,13 @@ def test_images_within_the_limits_are_not_resized_again(converter):
     tiny = TinyGr00t()
     tiny.images.update(min_pixels=EDGE * EDGE, max_pixels=EDGE * EDGE)
     assert [op["op"] for op in recipe(convert(converter, tiny))["image"]].count("resize") == 0
+
+
+def test_frames_that_are_padded_have_one_aspect(converter):
+    tiny = TinyGr00t()
+    tiny.images.update(min_pixels=400, max_pixels=400)
+    ops = [op["op"] for op in recipe(convert(converter, tiny, letterbox=True))["image"]]
+    assert "resize" in ops and "expect_size" not in ops
 
 
 def test_letterbox_pads_whatever_the_checkpoint_says(converter):

@@ -309,6 +309,50 @@ TEST_CASE("a sliver of an image is refused before it is padded or scaled") {
   CHECK(contains(refusal(apply(1, 8000), Code::bad_observation), "which becomes 256 x 2048000"));
 }
 
+namespace {
+
+/// The images of a policy that keeps their aspect, for cameras that lead to this width, and then resizes them.
+Json resized_twice(int width) {
+  const Json side = {{"op", "smallest_side"}, {"size", 16}, {"filter", "opencv_area"}};
+  const Json expected = {{"op", "expect_size"}, {"width", width}, {"height", 16}};
+  const Json resize = {{"op", "resize"}, {"width", 16}, {"height", 16}, {"filter", "pillow_bicubic"}};
+  return with("/image", Json::array({side, expected, resize, {{"op", "size"}, {"width", 16}, {"height", 16}}}));
+}
+
+std::string refusal_of(const Recipe& recipe, int width, int height) {
+  std::vector<float> out(static_cast<std::size_t>(3) * recipe.width * recipe.height);
+  const Frame frame{width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * height * 3)};
+  const Status taken = recipe.fit->apply(frame, out, "view");
+  return taken ? "" : taken.error().message();
+}
+
+}  // namespace
+
+TEST_CASE("a frame of another aspect is refused, also where images are resized twice") {
+  const auto square = parse_recipe(resized_twice(16).dump()), wide = parse_recipe(resized_twice(21).dump());
+  REQUIRE(square.ok());
+  REQUIRE(wide.ok());
+  CHECK(refusal_of(*square, 640, 640).empty());
+  CHECK(refusal_of(*square, 9, 9).empty());
+  CHECK(contains(refusal_of(*square, 640, 480),
+                 "expected an image with the aspect of 16 x 16, found 640 x 480, which becomes 21 x 16"));
+  CHECK(refusal_of(*wide, 640, 480).empty());
+  CHECK(refusal_of(*wide, 320, 240).empty());
+  CHECK(contains(refusal_of(*wide, 480, 640), "which becomes 16 x 21"));
+  CHECK(contains(refusal_of(*wide, 1280, 720), "which becomes 28 x 16"));
+}
+
+TEST_CASE("a resize that would squeeze the frames of any camera is refused with the bundle") {
+  Json recipe = resized_twice(16);
+  recipe["image"].erase(1);
+  CHECK(contains(refused(recipe), "processor.recipe.image[1].op: expected images of one aspect"));
+  const Json pad = {{"op", "square_pad"}};
+  recipe["image"].insert(recipe["image"].begin(), pad);
+  CHECK(parse_recipe(recipe.dump()).ok());
+  recipe["image"][0] = {{"op", "camera_size"}, {"width", 640}, {"height", 480}};
+  CHECK(parse_recipe(recipe.dump()).ok());
+}
+
 TEST_CASE("a frame of another camera than the policy was trained with is refused, and a crop takes the middle") {
   const Json crop = {{"op", "center_crop"}, {"width", 3}, {"height", 1}};
   Json recipe = Json::parse(kRecipe);

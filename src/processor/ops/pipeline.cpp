@@ -104,6 +104,7 @@ Image applied(const ByteOp& op, const Image& from, int width, int height) {
   if (std::holds_alternative<SmallestSide>(op))
     return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
   if (const auto* resize = std::get_if<ByteResize>(&op)) return {width, height, resized(from, *resize)};
+  if (std::holds_alternative<ExpectSize>(op)) return from;
   if (const auto* crop = std::get_if<CenterCrop>(&op)) return cropped(from, *crop);
   if (const auto* crop = std::get_if<CropAndResize>(&op))
     return {width, height, crop_tensorflow(from.rgb, from.width, from.height, crop->area, width, height)};
@@ -125,7 +126,15 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   const double most_grown = most_pixels_grown(frame);
   std::vector<Size> sizes = {{static_cast<double>(frame.width), static_cast<double>(frame.height)}};
   bool fits = true;
+  const auto another_aspect = [&](int width, int height) {
+    return Error{Code::bad_observation, where, fmt::format("an image with the aspect of {} x {}", width, height),
+                 fmt::format("{} x {}, which becomes {} x {}", frame.width, frame.height, sizes.back().width,
+                             sizes.back().height),
+                 "this policy's images keep their aspect; send those of the camera that the bundle was made for"};
+  };
   for (const ByteOp& op : pipeline.ops) {
+    if (const auto* size = std::get_if<ExpectSize>(&op); size && sizes.back() != size_after(*size, {}))
+      return another_aspect(size->width, size->height);
     if (const auto* crop = std::get_if<CenterCrop>(&op))
       fits &= crop->width <= sizes.back().width && crop->height <= sizes.back().height;
     sizes.push_back(std::visit([&](const auto& o) { return size_after(o, sizes.back()); }, op));
@@ -139,11 +148,7 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
     fits &= n_pixel <= static_cast<double>(ImageLimits().max_pixels);
   }
   if (!fits || sizes.back() != Size{static_cast<double>(pipeline.width), static_cast<double>(pipeline.height)})
-    return Error{Code::bad_observation, where,
-                 fmt::format("an image with the aspect of {} x {}", pipeline.width, pipeline.height),
-                 fmt::format("{} x {}, which becomes {} x {}", frame.width, frame.height, sizes.back().width,
-                             sizes.back().height),
-                 "this policy's images keep their aspect; send those of the camera that the bundle was made for"};
+    return another_aspect(pipeline.width, pipeline.height);
   Image image{frame.width, frame.height, *bytes};
   for (std::size_t i = 0; i < pipeline.ops.size(); ++i)
     image =
@@ -236,6 +241,16 @@ Status parse_stated_size(JsonFields& fields, Recipe& recipe) {
   return add(fields, recipe, op);
 }
 
+/// Whether images have the aspect of the frame, whatever that is, because an op keeps it.
+bool has_any_aspect(const Pipeline& pipeline) {
+  bool any = false;
+  for (const ByteOp& op : pipeline.ops) {
+    if (std::holds_alternative<SquarePad>(op) || std::holds_alternative<CameraSize>(op)) return false;
+    any = (any || std::holds_alternative<SmallestSide>(op)) && !std::holds_alternative<ExpectSize>(op);
+  }
+  return any;
+}
+
 /// The end of a pipeline: the size that the images must have.
 Status parse_size(JsonFields& fields, Recipe& recipe) {
   VLA_TRY(Pipeline* const pipeline, open_pipeline(fields, recipe));
@@ -249,7 +264,10 @@ Status parse_size(JsonFields& fields, Recipe& recipe) {
 }  // namespace
 
 Status parse_byte_resize(JsonFields& fields, Recipe& recipe) {
-  if (recipe.width > 0) return misplaced(fields, "images of any size before size, letterbox or resize");
+  VLA_TRY(Pipeline* const pipeline, open_pipeline(fields, recipe));
+  if (has_any_aspect(*pipeline))
+    return misplaced(fields,
+                     "images of one aspect: a smallest_side keeps that of every frame, which resize would squeeze");
   ByteResize op;
   VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
   VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));
@@ -265,6 +283,7 @@ Ops pipeline_ops() {
           {"image", "crop_fraction", parse_crop_fraction},
           {"image", "crop_and_resize", parse_crop_and_resize},
           {"image", "lanczos3", parse_stated_size<Lanczos3>},
+          {"image", "expect_size", parse_stated_size<ExpectSize>},
           {"image", "camera_size", parse_stated_size<CameraSize>},
           {"image", "center_crop", parse_stated_size<CenterCrop>},
           {"image", "size", parse_size}};

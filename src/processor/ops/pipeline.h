@@ -36,6 +36,12 @@ struct ByteResize {
   Filter filter = Filter::pillow_bicubic;
 };
 
+/// Images of one size alone, which follows from the aspect of the camera's frames.
+struct ExpectSize {
+  int width = 0;
+  int height = 0;
+};
+
 /// The middle of an image, no larger than it; of an odd rest that is cut off the half is rounded to even.
 struct CenterCrop {
   int width = 0;
@@ -60,8 +66,8 @@ struct JpegRoundTrip {
   int quality = 0;
 };
 
-using ByteOp = std::variant<JpegRoundTrip, SquarePad, SmallestSide, CropFraction, ByteResize, CameraSize, CenterCrop,
-                            Lanczos3, CropAndResize>;
+using ByteOp = std::variant<JpegRoundTrip, SquarePad, SmallestSide, CropFraction, ByteResize, ExpectSize, CameraSize,
+                            CenterCrop, Lanczos3, CropAndResize>;
 
 /// Ops on 8-bit images in order, and the size that the last one must leave.
 struct Pipeline {

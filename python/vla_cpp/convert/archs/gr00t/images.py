@@ -52,12 +52,16 @@ def read_images(processor: Section, area: Area, options: Options, notes: List[st
         width, height = _smallest_side(max(1, int(width * fraction)), max(1, int(height * fraction)), edge)
     held = held_size(width, height, area, "--camera-size", problems)
     if held != (width, height):
+        if not pad:  # the aspect is seen before the resize hides it
+            ops.append({"op": "expect_size", "width": width, "height": height})
         ops.append({"op": "resize", "width": held[0], "height": held[1], "filter": area.filter})
     width, height = held
     ops += [{"op": "size", "width": width, "height": height}, STANDARDIZE]
     if not pad:
         notes.append(
-            "images keep their aspect: those of {} are taken, others are refused ({})".format(camera_size or "square cameras", DOCS)
+            "images keep their aspect: those of {} become {}x{}, others are refused ({})".format(
+                camera_size or "square cameras", width, height, DOCS
+            )
         )
     return Images(width, height, ops)
 
