@@ -341,7 +341,10 @@ def load(checkpoint, dtype="float32"):
         raw["state"] = batch["observation.state"].numpy()
         return reference.before(batch)
 
-    return reference, before, lambda chunk: torch.from_numpy(reference.robot.actions(chunk[0].numpy(), raw["state"]))[None]
+    def after(chunk):
+        return torch.from_numpy(reference.robot.actions(chunk[0, : reference.robot.rows].numpy(), raw["state"]))[None]
+
+    return reference, before, after
 
 
 class Recorder(HeadTaps):
