@@ -8,6 +8,7 @@
 #include <unistd.h>
 
 #include <cerrno>
+#include <charconv>
 #include <cstring>
 #include <filesystem>
 #include <fstream>
@@ -16,6 +17,8 @@
 
 namespace vla {
 namespace {
+
+namespace fs = std::filesystem;
 
 constexpr std::string_view kPart = ".part";
 
@@ -43,7 +46,7 @@ int open_named(const std::string& path, unsigned mode) {
 }
 
 Status write_new(const std::string& path, const WriteTo& write, unsigned mode) {
-  const int unnamed = open_unnamed(std::filesystem::path(path).parent_path().string(), mode);
+  const int unnamed = open_unnamed(fs::path(path).parent_path().string(), mode);
   const int fd = unnamed >= 0 ? unnamed : open_named(path, mode);
   if (fd < 0) return cannot_write(path, errno);
   bool written = write(fd) && ::fsync(fd) == 0 && (unnamed < 0 || give_name(fd, path));
@@ -55,10 +58,10 @@ Status write_new(const std::string& path, const WriteTo& write, unsigned mode) {
 }
 
 /// Removes what programs that were killed have left of this file: parts that nobody writes any more.
-void remove_stale_parts(const std::filesystem::path& target) {
+void remove_stale_parts(const fs::path& target) {
   std::error_code ignored;
-  const std::filesystem::path folder = target.parent_path();
-  for (const auto& entry : std::filesystem::directory_iterator(folder.empty() ? "." : folder, ignored)) {
+  const fs::path folder = target.parent_path();
+  for (const auto& entry : fs::directory_iterator(folder.empty() ? "." : folder, ignored)) {
     const std::string name = entry.path().filename().string(), stem = target.filename().string() + ".";
     if (!name.starts_with(stem) || !name.ends_with(kPart) || name.size() != stem.size() + 8 + kPart.size()) continue;
     const int fd = ::open(entry.path().c_str(), O_RDONLY | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK);
@@ -68,21 +71,75 @@ void remove_stale_parts(const std::filesystem::path& target) {
   }
 }
 
-Status write_in_place(const std::string& path, const WriteTo& write) {
-  const int fd = ::open(path.c_str(), O_WRONLY | O_CLOEXEC);
-  const bool written = fd >= 0 && write(fd);
+/// A name beside `path` for what becomes it.
+std::string beside(const std::string& path) { return fmt::format("{}.{:08x}{}", path, std::random_device()(), kPart); }
+
+bool copy_all(int from, int to) {
+  if (::lseek(from, 0, SEEK_SET) != 0) return false;
+  std::vector<std::byte> block(1 << 20);
+  for (;;) {
+    const ssize_t n = ::read(from, block.data(), block.size());
+    if (n == 0) return true;
+    if (n < 0 && errno != EINTR) return false;
+    if (n > 0 && !write_all(to, {block.data(), static_cast<std::size_t>(n)})) return false;
+  }
+}
+
+/// What `write` writes, by way of a file without a name: a pipe cannot be written to out of order.
+bool write_through(int to, const WriteTo& write) {
+  std::error_code ignored;
+  const fs::path folder = fs::temp_directory_path(ignored);
+  int fd = open_unnamed(folder.string(), 0600);
+  if (fd < 0) {
+    const std::string part = beside((folder / "vla").string());
+    fd = open_named(part, 0600);
+    if (fd < 0) return false;
+    ::unlink(part.c_str());
+  }
+  const bool written = write(fd) && copy_all(fd, to);
   const int number = errno;
-  if (fd >= 0 && ::close(fd) != 0 && written) return cannot_write(path, errno);
+  ::close(fd);
+  errno = number;
+  return written;
+}
+
+Status write_in_place(const std::string& path, int fd, const WriteTo& write) {
+  if (fd < 0) return cannot_write(path, errno);
+  const bool written = write_through(fd, write);
+  const int number = errno;
+  if (::close(fd) != 0 && written) return cannot_write(path, errno);
   return written ? Status() : cannot_write(path, number);
+}
+
+/// The open file that a path such as /dev/stdout or /dev/fd/3 stands for, whatever it leads to; -1 for other paths.
+int descriptor_of(const std::string& path) {
+  if (path == "/dev/stdout") return STDOUT_FILENO;
+  if (path == "/dev/stderr") return STDERR_FILENO;
+  for (const std::string_view folder : {"/dev/fd/", "/proc/self/fd/"}) {
+    int fd = 0;
+    const char* const end = path.data() + path.size();
+    if (path.starts_with(folder) && std::from_chars(path.data() + folder.size(), end, fd).ptr == end) return fd;
+  }
+  return -1;
+}
+
+/// What links lead to, which need not be there. A link that leads to itself stays one.
+std::string behind_links(const std::string& path) {
+  constexpr int kMaxLinks = 40;
+  fs::path found = path;
+  std::error_code ignored;
+  for (int i = 0; i < kMaxLinks && fs::is_symlink(fs::symlink_status(found, ignored)); ++i)
+    found = found.parent_path() / fs::read_symlink(found, ignored);
+  return found.string();
 }
 
 }  // namespace
 
 Result<std::vector<std::byte>> read_file(const std::string& path, std::size_t limit) {
   std::error_code error;
-  if (!std::filesystem::is_regular_file(path, error))
+  if (!fs::is_regular_file(path, error))
     return Error{Code::io, path, "a file", error ? error.message() : "something that is not a regular file"};
-  const std::uintmax_t size = std::filesystem::file_size(path, error);
+  const std::uintmax_t size = fs::file_size(path, error);
   if (error) return Error{Code::io, path, "a readable file", error.message()};
   if (size > limit) return Error{Code::io, path, fmt::format("at most {} bytes", limit), fmt::format("{} bytes", size)};
   std::vector<std::byte> bytes(size);
@@ -111,15 +168,19 @@ Status write_file(const std::string& path, std::span<const std::byte> bytes) {
 }
 
 Status write_file(const std::string& path, const WriteTo& write) {
+  if (const int open = descriptor_of(path); open >= 0)
+    return write_in_place(path, ::fcntl(open, F_DUPFD_CLOEXEC, 0), write);
   std::error_code ignored;
-  const auto there = std::filesystem::status(path, ignored);
-  if (std::filesystem::exists(there) && !std::filesystem::is_regular_file(there)) return write_in_place(path, write);
-  const bool is_link = std::filesystem::is_symlink(std::filesystem::symlink_status(path, ignored));
-  const std::string target = is_link ? std::filesystem::weakly_canonical(path, ignored).string() : path;
+  const std::string target = behind_links(path);
+  const auto there = fs::symlink_status(target, ignored);
+  if (fs::is_symlink(there)) return cannot_write(path, ELOOP);
+  if (fs::exists(there) && !fs::is_regular_file(there))
+    return write_in_place(path, ::open(target.c_str(), O_WRONLY | O_CLOEXEC), write);
   remove_stale_parts(target);
-  const std::string part = fmt::format("{}.{:08x}{}", target, std::random_device()(), kPart);
+  const std::string part = beside(target);
   if (const Status written = write_new(part, write, 0666); !written)
     return Error{Code::io, path, written.error().expected, written.error().found};
+  if (fs::exists(there)) fs::permissions(part, there.permissions(), ignored);
   if (::rename(part.c_str(), target.c_str()) == 0) return {};
   const int number = errno;
   ::unlink(part.c_str());

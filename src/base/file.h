@@ -17,11 +17,14 @@ Result<std::vector<std::byte>> read_file(const std::string& path, std::size_t li
 
 /// Writes a file that does not exist yet. The file is written completely or not at all. Errors: io.
 Status write_new_file(const std::string& path, std::span<const std::byte> bytes, unsigned mode);
-/// Writes a file whole or not at all: the bytes go into a new file beside it, which takes its name when all of them are
-/// on the disk. A program that is killed leaves nothing, or, on file systems without files that have no name, a part
-/// which the next one removes. What is no regular file, such as a pipe, is written to as it is. Errors: io.
+/// Writes a file whole or not at all: the bytes go into a new file beside it, which takes its name and mode when all of
+/// them are on the disk. A program that is killed leaves nothing, or, on file systems without files that have no name,
+/// a part which the next one removes. Links are followed, and stay. What is no regular file, such as a pipe or a
+/// device, and an open file by the name of /dev/stdout or /dev/fd/3, get the bytes when all of them are made. Errors:
+/// io.
 Status write_file(const std::string& path, std::span<const std::byte> bytes);
-/// The same, for bytes that `write` puts into an open file. `write` returns false, with errno set, on failure.
+/// The same, for bytes that `write` puts into an open file, in any order. `write` returns false, with errno set, on
+/// failure.
 using WriteTo = std::function<bool(int file)>;
 Status write_file(const std::string& path, const WriteTo& write);
 /// Writes all bytes; false with errno set on failure.

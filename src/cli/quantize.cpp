@@ -213,7 +213,7 @@ class Trials {
 
 Status run(const QuantizeOptions& options) {
   std::error_code ignored;
-  if (std::filesystem::exists(options.to, ignored) && !options.force)
+  if (std::filesystem::is_regular_file(options.to, ignored) && !options.force)
     return Error{Code::usage, options.to, "a new file", "one that exists", "name another, or --force"};
 #ifdef VLA_SERVER
   std::optional<Trials> trials;

@@ -26,7 +26,9 @@ constexpr int kPollMs = 100;
 Result<int> open_to_write(const std::string& path, bool fresh) {
   const int flags = O_WRONLY | O_CREAT | O_CLOEXEC | O_NONBLOCK | O_NOFOLLOW | (fresh ? O_EXCL : O_TRUNC);
   const int fd = ::open(path.c_str(), flags, 0600);
-  if (fd >= 0 && !fresh && ::fchmod(fd, 0600) != 0) errno = 0;  // of another user's file: as it is
+  struct stat info;
+  const bool is_file = fd >= 0 && ::fstat(fd, &info) == 0 && S_ISREG(info.st_mode);
+  if (is_file && !fresh && ::fchmod(fd, 0600) != 0) errno = 0;  // of another user's file: as it is
   if (fd >= 0) return fd;
   if (errno == EEXIST) return Error{Code::io, path, "no such file yet", "one", "name another place, or remove it"};
   if (errno == ELOOP) return Error{Code::io, path, "a file", "a symbolic link", "name the file that it leads to"};

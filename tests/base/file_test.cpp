@@ -88,6 +88,57 @@ TEST_CASE("a link stays a link, and the file behind it is replaced") {
   CHECK(text_of(folder / "target") == "new");
 }
 
+TEST_CASE("a link to a file that is not there yet stays a link, and one to itself is an error") {
+  const Folder folder;
+  fs::create_directory(folder / "versions");
+  fs::create_symlink("versions/v3", folder / "link");
+  fs::create_symlink("link", folder / "second");
+  REQUIRE(write_file(folder / "second", "new").ok());
+  CHECK(fs::is_symlink(folder / "second"));
+  CHECK(fs::is_symlink(folder / "link"));
+  CHECK(text_of(folder / "versions/v3") == "new");
+  fs::create_symlink("loop", folder / "loop");
+  const Status looped = write_file(folder / "loop", "x");
+  REQUIRE_FALSE(looped.ok());
+  CHECK(looped.error().where == folder / "loop");
+  CHECK(fs::is_symlink(folder / "loop"));
+}
+
+TEST_CASE("a file that is replaced keeps its mode") {
+  const Folder folder;
+  REQUIRE(write_file(folder / "a", "old").ok());
+  fs::permissions(folder / "a", fs::perms::owner_read | fs::perms::owner_write);
+  REQUIRE(write_file(folder / "a", "new").ok());
+  CHECK((fs::status(folder / "a").permissions() & fs::perms::mask) == (fs::perms::owner_read | fs::perms::owner_write));
+}
+
+TEST_CASE("a pipe, a device and an open file get bytes that are written out of order, and stay what they are") {
+  const Folder folder;
+  const WriteTo backwards = [](int file) {
+    return ::ftruncate(file, 3) == 0 && ::pwrite(file, "bc", 2, 1) == 2 && ::pwrite(file, "a", 1, 0) == 1;
+  };
+  const std::string pipe = folder / "pipe";
+  REQUIRE(::mkfifo(pipe.c_str(), 0600) == 0);
+  const int reader = ::open(pipe.c_str(), O_RDONLY | O_NONBLOCK);
+  REQUIRE(write_file(pipe, backwards).ok());
+  char found[4] = {};
+  CHECK(::read(reader, found, 4) == 3);
+  CHECK(std::string(found) == "abc");
+  ::close(reader);
+  CHECK(fs::is_fifo(pipe));
+  fs::create_symlink("/dev/null", folder / "link");
+  CHECK(write_file(folder / "link", backwards).ok());
+  CHECK(fs::is_character_file(fs::status("/dev/null")));
+  const int log = ::open((folder / "log").c_str(), O_WRONLY | O_CREAT | O_APPEND, 0600);
+  REQUIRE(::write(log, "so far ", 7) == 7);
+  REQUIRE(write_file(fmt::format("/dev/fd/{}", log), backwards).ok());
+  ::close(log);
+  CHECK(text_of(folder / "log") == "so far abc");
+  const Status folders = write_file(folder.path.string(), "x");
+  REQUIRE_FALSE(folders.ok());
+  CHECK(folders.error().code == Code::io);
+}
+
 TEST_CASE("a new file never replaces one, and has the mode that was asked for") {
   const Folder folder;
   const std::string file = folder / "secret", text = "key";

@@ -59,6 +59,28 @@ def test_an_output_takes_the_place_of_a_file_behind_a_link_and_is_written_into_a
     os.close(reader)
 
 
+def test_an_output_is_written_to_a_device_and_an_open_file_which_stay_what_they_are(vla, golden, tmp_path):
+    link = tmp_path / "policy.npy"
+    link.symlink_to("v3.npy")
+    for out in ("/dev/null", link):
+        assert vla(*golden.arguments(options=("--out", out))).code == 0
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode) and link.is_symlink() and np.load(tmp_path / "v3.npy").dtype == np.float32
+    with open(tmp_path / "log", "ab") as log:
+        log.write(b"so far")
+        log.flush()
+        command = [vla.path, *map(str, golden.arguments(options=("--out", "/dev/stdout", "--json")))]
+        assert subprocess.run(command, env=vla.environment, stdout=log, timeout=60).returncode == 0
+    data = (tmp_path / "log").read_bytes()
+    assert data.startswith(b"so far\x93NUMPY") and data.endswith(b"}\n")
+    vla(*golden.arguments(options=("--out", tmp_path))).refused("io", str(tmp_path), "directory")
+
+
+def test_a_trace_into_a_device_leaves_its_mode(vla, golden):
+    before = os.stat("/dev/null").st_mode
+    server = Server(vla, golden.bundle, *LOCAL, "--trace", "/dev/null")
+    assert server.stop(signal.SIGTERM)[0] == 0 and os.stat("/dev/null").st_mode == before
+
+
 def test_a_key_that_does_not_fit_leaves_no_file(vla, tmp_path):
     full = limited(vla, 10, "keygen", tmp_path / "key")
     assert full.returncode == 9 and os.listdir(tmp_path) == []
