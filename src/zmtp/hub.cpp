@@ -133,9 +133,9 @@ class Connection : public std::enable_shared_from_this<Connection> {
     send(session_.take_output());
     read();
   }
-  void answer(std::string_view response, bool delimiter) {
+  void answer(std::string_view response, const Envelope& envelope) {
     guard([&] {
-      if (out_.size() < kMaxAnswers && n_unread_ < 2 * kMaxUnread) send(session_.pack(response, delimiter));
+      if (out_.size() < kMaxAnswers && n_unread_ < 2 * kMaxUnread) send(session_.pack(response, envelope));
     });
   }
   void drop(const char* why, const std::string& detail) {
@@ -296,8 +296,8 @@ class Hub::Sockets : public Shared {
     sweeper_.turn([this] { sweep_all(); });
   }
 
-  void send(std::uint64_t connection, std::string_view response, bool delimiter) {
-    answer(connection, [&](Connection& to) { to.answer(response, delimiter); });
+  void send(std::uint64_t connection, std::string_view response, const Envelope& envelope) {
+    answer(connection, [&](Connection& to) { to.answer(response, envelope); });
   }
 
  private:
@@ -323,8 +323,8 @@ Hub::Hub(net::Loop& loop, const Limits& limits, const CurveKeys* keys)
 Hub::~Hub() = default;
 Result<std::string> Hub::bind(const std::string& endpoint) { return sockets_->bind(endpoint); }
 void Hub::begin(Handler& handler) { sockets_->begin(handler); }
-void Hub::send(std::uint64_t connection, std::string_view response, bool delimiter) {
-  sockets_->send(connection, response, delimiter);
+void Hub::send(std::uint64_t connection, std::string_view response, const Envelope& envelope) {
+  sockets_->send(connection, response, envelope);
 }
 bool Hub::has_answers() const { return sockets_->has_answers(); }
 

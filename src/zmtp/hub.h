@@ -45,7 +45,7 @@ class Hub {
   /// Accepts connections from now on; call it before every turn of the loop. The handler must outlive the hub.
   void begin(Handler& handler);
   /// Sends an answer, unless the connection has ended or does not read its answers.
-  void send(std::uint64_t connection, std::string_view response, bool delimiter);
+  void send(std::uint64_t connection, std::string_view response, const Envelope& envelope);
   /// Whether an answer is not sent yet.
   bool has_answers() const;
 

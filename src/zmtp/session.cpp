@@ -17,6 +17,8 @@ namespace {
 constexpr unsigned kMore = 1, kLong = 2, kCommand = 4;   // flags of a frame
 constexpr unsigned kMoreInside = 1, kCommandInside = 2;  // flags inside a CURVE box
 constexpr int kMaxFrames = 1024;                         // frames of a refused message that are skipped
+constexpr std::size_t kMaxEnvelope = 8;                  // frames of an envelope
+constexpr std::size_t kMaxAddress = 255;                 // bytes of such a frame, as in ZeroMQ
 constexpr std::size_t kGreeting = 64, kMaxCommand = 4096;
 constexpr std::size_t kStep = 256 << 10;     // most bytes read at once, so that connections take turns
 constexpr std::size_t kPrefix = 64;          // bytes kept of a refused message: enough for its number
@@ -25,6 +27,11 @@ constexpr std::string_view kSignature("\xff\0\0\0\0\0\0\0\0\x7f", 10);
 
 Error ended(const char* why, std::string expected, std::string found) {
   return {Code::bad_request, why, std::move(expected), std::move(found)};
+}
+
+Error several_frames() {
+  return {Code::bad_request, "request", "one frame, behind an empty one where others come first", "several",
+          "see docs/protocol.md"};
 }
 
 std::string_view text_of(std::span<const std::byte> bytes) {
@@ -142,8 +149,9 @@ Status Session::choose_memory() {
     return ended("size", "a frame that can be", fmt::format("one of {} bytes", size_));
   const std::size_t limit = max_message_ + (curve_ ? CurveSession::kOverhead + 1 : 0);
   std::optional<Error> refused;
+  if (is_plain && !curve_ && is_addressed() && size_ > kMaxAddress) refuse_several();
   if (is_plain && n_part_ > 0 && !curve_) {
-    refused = Error{Code::bad_request, "request", "one frame", "several", "see docs/protocol.md"};
+    refused = several_frames();
   } else if (is_plain && size_ > limit) {
     refused = Error{Code::too_large, "request", fmt::format("at most {} bytes", max_message_), fmt::format("{}", size_),
                     "send smaller or compressed images"};
@@ -230,19 +238,39 @@ Status Session::heartbeat(std::span<const std::byte> command) {
   return {};
 }
 
+/// Whether frames of an envelope came, and not yet the empty one that ends it.
+bool Session::is_addressed() const {
+  return message_ && !message_->envelope.empty() && !message_->envelope.back().empty();
+}
+
+/// The frames that looked like an envelope belong to the message. The first one contains the message's number.
+void Session::refuse_several() {
+  const std::string first = std::exchange(message_->envelope, {}).front();
+  if (std::optional<net::Bytes> bytes = net::Bytes::make(first.size())) {
+    std::copy_n(std::as_bytes(std::span(first)).begin(), first.size(), bytes->span().begin());
+    message_->bytes = std::move(*bytes);
+  }
+  message_->size = first.size();
+  message_->refused = several_frames();
+  n_part_ = 1;
+}
+
 /// Returns the message once its last frame is complete.
 std::optional<Message> Session::end_part(bool more) {
   if (!message_) message_.emplace();
-  if (n_part_ == 0 && size_ == 0 && more && !message_->delimiter) {
-    message_->delimiter = true;
+  Envelope& envelope = message_->envelope;
+  const bool may_be_address = size_ <= kMaxAddress && envelope.size() < kMaxEnvelope && !message_->refused;
+  if (n_part_ == 0 && more && may_be_address && (envelope.empty() || is_addressed())) {
+    envelope.emplace_back(text_of(frame_.span()));
     return std::nullopt;
   }
+  if (n_part_ == 0 && is_addressed()) refuse_several();
   if (n_part_ == 0) {
     message_->bytes = std::exchange(frame_, {});
     message_->size = size_;
     n_part_ = 1;
   } else if (!message_->refused) {  // the flag of an encrypted frame, readable only now
-    message_->refused = Error{Code::bad_request, "request", "one frame", "several", "see docs/protocol.md"};
+    message_->refused = several_frames();
   }
   if (more) return std::nullopt;
   n_part_ = n_frame_ = 0;
@@ -268,10 +296,10 @@ void Session::put(std::string& out, std::string_view content, unsigned flags) {
   out += content;
 }
 
-std::string Session::pack(std::string_view content, bool delimiter) {
+std::string Session::pack(std::string_view content, const Envelope& envelope) {
   std::string out;
   out.reserve(content.size() + 64);
-  if (delimiter) put(out, "", kMore);
+  for (const std::string& frame : envelope) put(out, frame, kMore);
   put(out, content, 0);
   return out;
 }

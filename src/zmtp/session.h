@@ -8,6 +8,7 @@
 #include <optional>
 #include <span>
 #include <string>
+#include <vector>
 
 #include "base/result.h"
 #include "net/bytes.h"
@@ -15,10 +16,14 @@
 
 namespace vla::zmtp {
 
+/// The frames before a message, with which its answer begins: an empty one of a REQ socket, and before it the number of
+/// the request, if the socket correlates, or the addresses that proxies add. A DEALER socket sends none.
+using Envelope = std::vector<std::string>;
+
 /// One message of a peer.
 struct Message {
   net::Bytes bytes;              // bytes of its frame; only the first ones if the message is refused
-  bool delimiter = false;        // an empty frame preceded it, as REQ sockets send
+  Envelope envelope;             // up to its empty frame
   std::size_t size = 0;          // size that the peer announced
   std::optional<Error> refused;  // bad_request (several frames), too_large, out_of_memory
 };
@@ -42,7 +47,7 @@ class Session {
   std::string take_output() { return std::exchange(output_, {}); }
 
   /// Encodes a message or a heartbeat for the socket. Call it after the handshake.
-  std::string pack(std::string_view content, bool delimiter);
+  std::string pack(std::string_view content, const Envelope& envelope);
   std::string ping();
 
   bool is_open() const { return state_ == State::open; }
@@ -62,6 +67,8 @@ class Session {
   Result<std::optional<Message>> end_frame();
   Status handshake(std::span<const std::byte> command);
   Status heartbeat(std::span<const std::byte> command);
+  bool is_addressed() const;
+  void refuse_several();
   std::optional<Message> end_part(bool more);
   void put(std::string& out, std::string_view content, unsigned flags);
 

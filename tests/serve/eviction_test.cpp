@@ -27,7 +27,7 @@ struct Generous : Hub::Handler {
   explicit Generous(Hub& its_hub) : hub(its_hub) {}
   void received(zmtp::Client& client, zmtp::Message) override {
     ++n_received;
-    hub.send(client.connection, std::string(kMiB, 'a'), false);
+    hub.send(client.connection, std::string(kMiB, 'a'), {});
   }
   void dropped(const zmtp::Client&, const std::string&, const std::string&) override {}
 };

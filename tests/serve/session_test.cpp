@@ -92,9 +92,9 @@ TEST_CASE("messages come out the same however their bytes are cut") {
     REQUIRE_FALSE(outcome.ended);
     REQUIRE(outcome.messages.size() == 3);
     CHECK(text_of(outcome.messages[0]) == "short");
-    CHECK_FALSE(outcome.messages[0].delimiter);
+    CHECK(outcome.messages[0].envelope.empty());
     CHECK(text_of(outcome.messages[1]) == std::string(999, 'x'));
-    CHECK(outcome.messages[1].delimiter);
+    CHECK(outcome.messages[1].envelope == Envelope{""});
     CHECK(outcome.messages[2].bytes.size() == 0);
     CHECK(session.n_held() == 0);
   }
@@ -102,7 +102,7 @@ TEST_CASE("messages come out the same however their bytes are cut") {
 
 TEST_CASE("a message of several frames takes no memory and is refused once it is whole") {
   Session session(kMaxMessage, nullptr);
-  REQUIRE_FALSE(feed(session, kHandshake + frame("first", 1)).ended);
+  REQUIRE_FALSE(feed(session, kHandshake + frame("", 1) + frame("first", 1)).ended);
   for (int i = 0; i < 500; ++i) {
     const Outcome outcome = feed(session, frame("", 1) + frame("further", 1));
     REQUIRE_FALSE(outcome.ended);
@@ -115,6 +115,39 @@ TEST_CASE("a message of several frames takes no memory and is refused once it is
   CHECK(outcome.messages[0].refused->found == "several");
   CHECK(text_of(outcome.messages[1]) == "next");
   CHECK_FALSE(outcome.messages[1].refused);
+}
+
+TEST_CASE("frames before the empty one come back with the answer, however their bytes are cut") {
+  const std::string bytes = kHandshake + frame(std::string("\0\0\0\7", 4), 1) + frame("", 1) + frame("request") +
+                            frame("far", 1) + frame("near", 1) + frame("", 1) + frame("routed");
+  for (std::size_t step : {1, 3, 64, 1 << 20}) {
+    CAPTURE(step);
+    Session session(kMaxMessage, nullptr);
+    const Outcome outcome = feed(session, bytes, step);
+    REQUIRE_FALSE(outcome.ended);
+    REQUIRE(outcome.messages.size() == 2);
+    CHECK_FALSE(outcome.messages[0].refused);
+    CHECK(text_of(outcome.messages[0]) == "request");
+    CHECK(outcome.messages[0].envelope == Envelope{std::string("\0\0\0\7", 4), ""});
+    CHECK(outcome.messages[1].envelope == Envelope{"far", "near", ""});
+    const std::string answer = session.pack("answer", outcome.messages[1].envelope);
+    CHECK(answer == frame("far", 1) + frame("near", 1) + frame("", 1) + frame("answer"));
+  }
+}
+
+TEST_CASE("frames without an empty one are several, and the first has the number") {
+  for (const std::string& rest : {frame("last"), frame(std::string(300, 'x')), frame("more", 1) + frame("last"),
+                                  frame(std::string(300, 'x'), 1) + frame("last")}) {
+    Session session(kMaxMessage, nullptr);
+    const Outcome outcome = feed(session, kHandshake + frame("number", 1) + rest + frame("next"));
+    REQUIRE_FALSE(outcome.ended);
+    REQUIRE(outcome.messages.size() == 2);
+    REQUIRE(outcome.messages[0].refused);
+    CHECK(outcome.messages[0].refused->found == "several");
+    CHECK(text_of(outcome.messages[0]) == "number");
+    CHECK(outcome.messages[0].envelope.empty());
+    CHECK(text_of(outcome.messages[1]) == "next");
+  }
 }
 
 TEST_CASE("a message of very many frames ends the connection") {

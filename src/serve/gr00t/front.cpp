@@ -25,7 +25,7 @@ Kind kind_of(const std::string& endpoint) {
 class Front::Request final : public Call {
  public:
   Request(Front& front, std::uint64_t connection, zmtp::Message message)
-      : front_(front), connection_(connection), delimiter_(message.delimiter), bytes_(std::move(message.bytes)) {}
+      : front_(front), connection_(connection), envelope_(std::move(message.envelope)), bytes_(std::move(message.bytes)) {}
 
   /// The endpoint that it is for. Errors: bad_request, bad_observation.
   Result<std::string> read() {
@@ -59,7 +59,7 @@ class Front::Request final : public Call {
     return encode_reply(std::move(reply), observed_.dialect, front_.names_, policy.description);
   }
   std::string encode(const Error& error) override { return encode_error(error); }
-  void send(const std::string& answer) override { front_.hub_.send(connection_, answer, delimiter_); }
+  void send(const std::string& answer) override { front_.hub_.send(connection_, answer, envelope_); }
   void send_out_of_memory() noexcept override try {
     bytes_ = {};
     send(encode_error(out_of_memory("request")));
@@ -69,7 +69,7 @@ class Front::Request final : public Call {
  private:
   Front& front_;
   const std::uint64_t connection_;
-  const bool delimiter_;
+  const zmtp::Envelope envelope_;
   net::Bytes bytes_;
   msgpack::Value message_;  // over the bytes, as what follows
   Observed observed_;

@@ -40,18 +40,18 @@ class NativeFront::Request final : public NativeCall {
       : NativeCall(front.options_, std::move(message.bytes), envelope),
         front_(front),
         connection_(connection),
-        delimiter_(message.delimiter) {}
+        before_(std::move(message.envelope)) {}
 
-  void send(const std::string& answer) override { front_.hub_.send(connection_, answer, delimiter_); }
+  void send(const std::string& answer) override { front_.hub_.send(connection_, answer, before_); }
   void send_out_of_memory() noexcept override {
     free();
-    front_.send_out_of_memory(connection_, request_id(), delimiter_);
+    front_.send_out_of_memory(connection_, request_id(), before_);
   }
 
  private:
   NativeFront& front_;
   const std::uint64_t connection_;
-  const bool delimiter_;  // the client put an empty frame before the request, as REQ sockets do
+  const zmtp::Envelope before_;  // the answer
 };
 
 Result<std::unique_ptr<NativeFront>> NativeFront::open(net::Loop& loop, const ServerOptions& options) {
@@ -87,7 +87,7 @@ void NativeFront::dropped(const zmtp::Client& client, const std::string& why, co
 
 void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
   const std::uint64_t connection = client.connection;
-  const bool delimiter = message.delimiter;
+  const zmtp::Envelope before = message.envelope;
   std::uint64_t request_id = 0;
   try {
     Status valid = message.refused ? Status(*message.refused) : Status();
@@ -112,14 +112,15 @@ void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
     io_->received(job);
     handle(client, std::move(job), envelope, valid);
   } catch (const std::bad_alloc&) {
-    send_out_of_memory(connection, request_id, delimiter);
+    send_out_of_memory(connection, request_id, before);
     io_->count_error();
   }
 }
 
 /// Refuses a request for want of memory: what was answered otherwise has been freed by now.
-void NativeFront::send_out_of_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept try {
-  hub_.send(connection, refusal(request_id, out_of_memory("request")), delimiter);
+void NativeFront::send_out_of_memory(std::uint64_t connection, std::uint64_t request_id,
+                                     const zmtp::Envelope& before) noexcept try {
+  hub_.send(connection, refusal(request_id, out_of_memory("request")), before);
 } catch (const std::exception&) {  // not even for that: the client's patience ends it
 }
 

@@ -29,7 +29,7 @@ class NativeFront final : public Front, zmtp::Hub::Handler {
   void dropped(const zmtp::Client& client, const std::string& why, const std::string& detail) override;
   void handle(zmtp::Client& client, Job job, const wire::Envelope& envelope, const Status& valid);
   Result<v1::Response> answer_now(zmtp::Client& client, const Job& job, const wire::Envelope& envelope) const;
-  void send_out_of_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept;
+  void send_out_of_memory(std::uint64_t connection, std::uint64_t request_id, const zmtp::Envelope& before) noexcept;
 
   const ServerOptions options_;
   const std::optional<zmtp::CurveKeys> keys_;
