@@ -71,6 +71,15 @@ def test_planes_and_floats_are_the_same_image(case, client):
     assert client.ask(pack(planes, openpi_array))["actions"].tobytes() == expected
 
 
+def test_a_message_over_the_limit_ends_with_code_1009_which_the_client_can_read(served):
+    for _ in range(8):  # a race where the rest of the message is not read
+        with WebSocket(served[1]) as client:
+            client.receive()
+            client.send(bytes(24 << 20))
+            opcode, end = client.receive()
+            assert opcode == 8 and end[:2] == (1009).to_bytes(2, "big")
+
+
 def test_without_a_seed_chunks_differ_and_tell_theirs(case, client):
     first, second = (client.ask(pack(observation(case), openpi_array)) for _ in range(2))
     assert first["actions"].tobytes() != second["actions"].tobytes()

@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include <array>
 #include <boost/asio/dispatch.hpp>
 #include <boost/asio/ip/tcp.hpp>
 #include <boost/beast/core/flat_buffer.hpp>
@@ -17,6 +18,8 @@
 #include <deque>
 #include <exception>
 #include <optional>
+#include <type_traits>
+#include <utility>
 
 #include "net/listener.h"
 #include "net/sweeper.h"
@@ -50,6 +53,33 @@ Response plain(const Request& request, http::status status, std::string body) {
   return response;
 }
 
+/// A connection that is ended by the server reads over what the peer still sends, so that the peer gets the frame that
+/// says why: closing with bytes unread resets a TCP connection. The sweeps bound the time.
+struct Socket : tcp::socket {
+  explicit Socket(tcp::socket socket) : tcp::socket(std::move(socket)) {}
+  std::array<char, 4096> unread;
+};
+
+template <class Handler>
+struct ReadOver {
+  Socket& socket;
+  Handler handler;
+
+  void operator()(error_code error, std::size_t = 0) {
+    if (error) return handler(error == asio::error::eof ? error_code() : error);
+    const auto room = asio::buffer(socket.unread);
+    socket.async_read_some(room, std::move(*this));
+  }
+};
+
+/// Beast calls it when the close frame has left. Its own for a tcp::socket stops after the first bytes.
+template <class Handler>
+void async_teardown(beast::role_type, Socket& socket, Handler&& handler) {
+  error_code ignored;
+  socket.shutdown(tcp::socket::shutdown_send, ignored);
+  ReadOver<std::decay_t<Handler>>{socket, std::forward<Handler>(handler)}({});
+}
+
 class Connection;
 
 /// The common state of the connections.
@@ -61,7 +91,10 @@ struct Shared : net::Connections<Connection> {
 class Connection : public std::enable_shared_from_this<Connection> {
  public:
   Connection(Shared& shared, tcp::socket socket, Peer peer)
-      : shared_(shared), peer_(std::move(peer)), group_(net::group_of(peer_.address)), stream_(std::move(socket)) {
+      : shared_(shared),
+        peer_(std::move(peer)),
+        group_(net::group_of(peer_.address)),
+        stream_(Socket(std::move(socket))) {
     parser_.header_limit(kMaxHeader);
     stream_.read_message_max(shared.limits.message);
     stream_.auto_fragment(false);
@@ -236,7 +269,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   Shared& shared_;
   Peer peer_;
   const std::string group_;  // of its address
-  websocket::stream<tcp::socket> stream_;
+  websocket::stream<Socket> stream_;
   beast::flat_buffer buffer_;  // the header, then the message that is being received or that waits
   http::request_parser<http::empty_body> parser_;
   Response response_;
