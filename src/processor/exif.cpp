@@ -82,44 +82,14 @@ std::optional<int> search_xmp(const std::string& xmp) {
 
 }  // namespace
 
-Result<int> orientation(std::span<const std::uint8_t> exif, const std::string& xmp, const std::string& where) {
+int orientation(std::span<const std::uint8_t> exif, const std::string& xmp) {
+  const bool little = exif.size() >= 8 && exif[0] == 'I' && exif[1] == 'I';
+  const bool big = exif.size() >= 8 && exif[0] == 'M' && exif[1] == 'M';
+  const Tiff tiff(exif, little);
   std::optional<int> found;
-  if (!exif.empty()) {
-    const bool little = exif.size() >= 8 && exif[0] == 'I' && exif[1] == 'I';
-    const bool big = exif.size() >= 8 && exif[0] == 'M' && exif[1] == 'M';
-    const Tiff tiff(exif, little);
-    if ((!little && !big) || tiff.read(2, 2) != 42u)
-      return refused(where, "EXIF data that starts as a TIFF structure", "other bytes", "remove the EXIF data");
-    found = search_directory(tiff, *tiff.read(4, 4));
-  }
+  if ((little || big) && tiff.read(2, 2) == 42u) found = search_directory(tiff, *tiff.read(4, 4));
   if (!found) found = search_xmp(xmp);
   return found && *found >= 1 && *found <= 8 ? *found : 1;
-}
-
-void turn_upright(Image& image, int orientation) {
-  if (orientation == 1) return;
-  // Source coordinates of the upright pixel (x, y): optionally exchanged, then mirrored.
-  const bool exchanged = orientation >= 5;
-  const bool mirror_x = orientation == 2 || orientation == 3 || orientation == 7 || orientation == 8;
-  const bool mirror_y = orientation == 3 || orientation == 4 || orientation == 6 || orientation == 7;
-  const std::ptrdiff_t source_width = image.width, source_height = image.height;
-  const std::ptrdiff_t width = exchanged ? source_height : source_width,
-                       height = exchanged ? source_width : source_height;
-  const std::ptrdiff_t first = (mirror_y ? (source_height - 1) * source_width : 0) + (mirror_x ? source_width - 1 : 0);
-  const std::ptrdiff_t along_x = mirror_x ? -1 : 1, along_y = mirror_y ? -source_width : source_width;
-  const std::ptrdiff_t step_x = exchanged ? along_y : along_x, step_y = exchanged ? along_x : along_y;
-  std::vector<std::uint8_t> turned(image.rgb.size());
-  // Columns become rows in strips that stay in the cache.
-  constexpr std::ptrdiff_t kStrip = 64;
-  for (std::ptrdiff_t left = 0; left < width; left += kStrip)
-    for (std::ptrdiff_t y = 0; y < height; ++y) {
-      const std::uint8_t* in = image.rgb.data() + 3 * (first + y * step_y + left * step_x);
-      std::uint8_t* out = turned.data() + 3 * (y * width + left);
-      for (std::ptrdiff_t x = left; x < std::min(left + kStrip, width); ++x, out += 3, in += 3 * step_x)
-        out[0] = in[0], out[1] = in[1], out[2] = in[2];
-    }
-  image = {static_cast<int>(width), static_cast<int>(height), std::move(turned), std::move(image.exif),
-           std::move(image.xmp)};
 }
 
 }  // namespace vla::codecs

@@ -64,9 +64,7 @@ Status check_floats(std::span<const float> values, const std::string& where) {
 Result<Frame> decode_pixels(codecs::Bytes file, const std::string& where, const ImageLimits& limits) {
   VLA_TRY(codecs::Image image,
           codecs::is_png(file) ? codecs::decode_png(file, where, limits) : codecs::decode_jpeg(file, where, limits));
-  VLA_TRY(const int orientation, codecs::orientation(image.exif, image.xmp, where));
-  codecs::turn_upright(image, orientation);
-  return Frame{image.width, image.height, std::move(image.rgb)};
+  return Frame{image.width, image.height, std::move(image.rgb), codecs::orientation(image.exif, image.xmp)};
 }
 
 Result<Frame> decode_npy(codecs::Bytes file, const std::string& where, const ImageLimits& limits) {

@@ -17,7 +17,7 @@ namespace vla::codecs {
 
 using Bytes = std::span<const std::byte>;
 
-/// The pixels and metadata of a PNG or JPEG file, before orientation.
+/// The pixels and metadata of a PNG or JPEG file.
 struct Image {
   int width = 0;
   int height = 0;
@@ -31,8 +31,8 @@ Status check_size(std::int64_t width, std::int64_t height, const std::string& wh
 
 /// The size of a PNG or JPEG file's image, and the work of decoding it, from its header.
 struct ImageHeader {
-  int width = 0, height = 0;  // as they are stored, before the image is turned upright
-  std::int64_t work = 0;      // of decoding, counted in pixels of about 10 ns
+  int width = 0, height = 0;
+  std::int64_t work = 0;  // of decoding, counted in pixels of about 10 ns
 };
 
 /// Reads no more than the header and the places of scans. Errors: those of `decode_image` that a header shows.
@@ -52,12 +52,8 @@ Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimit
 /// encode_jpeg and decode_jpeg leave them. Throws std::bad_alloc.
 std::vector<std::uint8_t> through_jpeg(const std::vector<std::uint8_t>& rgb, int width, int height, int quality);
 
-/// The EXIF orientation, 1 to 8, or failing that the XMP one; 1 when neither says. Errors: bad_observation for EXIF
-/// data that does not start as a TIFF structure. Source: Pillow Image.getexif, TiffImagePlugin
-/// ImageFileDirectory_v2.load.
-Result<int> orientation(std::span<const std::uint8_t> exif, const std::string& xmp, const std::string& where);
-
-/// Turns the image upright. Source: Pillow ImageOps.exif_transpose.
-void turn_upright(Image& image, int orientation);
+/// The EXIF orientation, 1 to 8, or failing that the XMP one; 1 when neither says, or nothing that can be read. Source:
+/// Pillow Image.getexif, TiffImagePlugin ImageFileDirectory_v2.load.
+int orientation(std::span<const std::uint8_t> exif, const std::string& xmp);
 
 }  // namespace vla::codecs

@@ -64,11 +64,10 @@ bool guarded_header(JpegReader& reader, Bytes file) {
 /// The facts in a file's markers.
 struct Markers {
   std::int64_t width = 0, height = 0, n_scan = 0;
-  bool may_turn = false;  // has EXIF data or XMP
 };
 
 Markers read_markers(Bytes file) {
-  constexpr unsigned kEnd = 0xD9, kScan = 0xDA, kMetadata = 0xE1;
+  constexpr unsigned kEnd = 0xD9, kScan = 0xDA;
   const auto byte = [&](std::size_t at) { return std::to_integer<unsigned>(file[at]); };
   Markers found;
   for (std::size_t at = 2; at + 1 < file.size();) {
@@ -81,7 +80,6 @@ Markers read_markers(Bytes file) {
     }
     if (marker == kEnd) break;
     found.n_scan += marker == kScan ? 1 : 0;
-    found.may_turn |= marker == kMetadata;
     const bool is_frame = marker >= 0xC0 && marker <= 0xCF && marker != 0xC4 && marker != 0xC8 && marker != 0xCC;
     if (is_frame && found.height == 0 && at + 8 < file.size())
       found.height = byte(at + 5) << 8 | byte(at + 6), found.width = byte(at + 7) << 8 | byte(at + 8);
@@ -215,13 +213,12 @@ bool is_jpeg(Bytes file) {
   return file.size() >= sizeof kStart && std::memcmp(file.data(), kStart, sizeof kStart) == 0;
 }
 
-/// A scan passes over all pixels and costs a quarter of the first, turning the image a half; a byte of code costs as
-/// much as a pixel.
+/// A scan passes over all pixels and costs a quarter of the first; a byte of code costs as much as a pixel.
 Result<ImageHeader> jpeg_header(Bytes file, const std::string& where, const ImageLimits& limits) {
   const Markers found = read_markers(file);
   VLA_CHECK(check_size(found.width, found.height, where, limits));
   VLA_CHECK(check_scans(found, where));
-  const std::int64_t quarters = 3 + found.n_scan + (found.may_turn ? 2 : 0);
+  const std::int64_t quarters = 3 + found.n_scan;
   return ImageHeader{static_cast<int>(found.width), static_cast<int>(found.height),
                      found.width * found.height * quarters / 4 + static_cast<std::int64_t>(file.size())};
 }

@@ -122,23 +122,19 @@ bool expand_palette(PngReader& reader) {
   return true;
 }
 
-/// The chunks of a file that tell how an image is to be turned.
+/// The chunks of a file that tell how viewers are to turn an image.
 struct Orientation {
   Bytes exif;            // the last eXIf chunk
   std::string_view xmp;  // the last XMP packet, with what stands before it
 };
 
-/// Notes an XMP packet. Nothing is unpacked to look for one, or for the EXIF data that ImageMagick kept as hex digits
-/// before PNG had a chunk for it: returns what is refused, since the reference would turn by it.
-const char* read_text(std::string_view type, std::string_view content, Orientation& orientation) {
-  if (type != "tEXt" && type != "zTXt" && type != "iTXt") return nullptr;
+/// Keeps an XMP packet. Nothing is unpacked to look for one.
+void read_text(std::string_view type, std::string_view content, Orientation& orientation) {
+  if (type != "tEXt" && type != "iTXt") return;
   const std::string_view keyword = content.substr(0, content.find('\0'));
-  if (keyword == "Raw profile type exif") return "EXIF data as text";
-  if (keyword != "XML:com.adobe.xmp") return nullptr;
+  if (keyword != "XML:com.adobe.xmp") return;
   content.remove_prefix(std::min(content.size(), keyword.size() + 1));
-  if (type == "zTXt" || (type == "iTXt" && content.starts_with('\1'))) return "a compressed XMP packet";
   orientation.xmp = content;
-  return nullptr;
 }
 
 void drop_exif_name(std::vector<std::uint8_t>& exif) {
@@ -154,7 +150,7 @@ std::uint32_t number_at(Bytes file, std::size_t at) {
 }
 
 /// Walks the chunks up to the end before libpng does: it would take memory for the length that a chunk states, up to
-/// 2 GiB, before it reads, and would go on without an orientation whose chunk is damaged.
+/// 2 GiB, before it reads, and would go on without a chunk that is damaged.
 Status walk(Bytes file, const std::string& where, Orientation& orientation) {
   const auto damaged = [&](const char* found) { return refused(where, "a whole PNG image", found); };
   constexpr std::size_t kAround = 12;  // length, type and checksum
@@ -167,9 +163,7 @@ Status walk(Bytes file, const std::string& where, Orientation& orientation) {
     const std::string_view text(reinterpret_cast<const char*>(content.data()), content.size());
     if (text.starts_with("IEND")) return {};
     if (text.starts_with("eXIf")) orientation.exif = content.subspan(4);
-    if (const char* found = read_text(text.substr(0, 4), text.substr(4), orientation))
-      return refused(where, "a PNG image whose orientation, if it has one, is in an eXIf chunk", found,
-                     "save it without metadata, turned upright");
+    read_text(text.substr(0, 4), text.substr(4), orientation);
     at += length + kAround;
   }
   return damaged("a truncated one");
@@ -227,3 +221,23 @@ Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits
 }
 
 }  // namespace vla::codecs
+
+namespace vla {
+
+Result<std::vector<std::byte>> encode_png(const Frame& frame) {
+  png_image image = {};
+  image.version = PNG_IMAGE_VERSION;
+  image.width = static_cast<png_uint_32>(frame.width);
+  image.height = static_cast<png_uint_32>(frame.height);
+  image.format = PNG_FORMAT_RGB;
+  const std::uint8_t* const rgb = std::get<std::vector<std::uint8_t>>(frame.rgb).data();
+  png_alloc_size_t size = 0;
+  std::vector<std::byte> file;
+  if (png_image_write_get_memory_size(image, size, 0, rgb, 0, nullptr) != 0) {
+    file.resize(size);
+    if (png_image_write_to_memory(&image, file.data(), &size, 0, rgb, 0, nullptr) != 0) return file;
+  }
+  return Error{Code::out_of_memory, "picture", "", "no memory for the PNG encoder"};
+}
+
+}  // namespace vla

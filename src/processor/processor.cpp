@@ -96,6 +96,11 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs) 
     const auto& [index, name, frame] = present[i];
     inputs.views |= 1U << index;
     VLA_CHECK(check_frame(*frame, *name));
+    if (frame->orientation != 1)
+      inputs.notes.push_back(
+          fmt::format("{}: EXIF orientation {} is not followed: the frame is taken as it is stored; turn its pixels if "
+                      "the camera is mounted so",
+                      *name, frame->orientation));
     if (const auto note = codecs::suspicious(*frame)) inputs.notes.push_back(fmt::format("{}: {}", *name, *note));
     VLA_CHECK(encode_view(*frame, *name, static_cast<int>(index), {inputs.pixels.data() + i * size, size}));
   }

@@ -48,7 +48,7 @@ def hostile_pngs(sound):
         "a thousand packed texts": (with_chunks(*[_chunk(b"zTXt", b"comment\0\0" + bomb)] * 1000), True),
         "a thousand packed international texts": (with_chunks(*[_chunk(b"iTXt", b"comment\0\1\0\0\0" + bomb)] * 1000), True),
         "a packed profile": (with_chunks(_chunk(b"iCCP", b"profile\0\0" + bomb)), True),
-        "packed orientations": (with_chunks(*[_chunk(b"iTXt", xmp)] * 200), False),
+        "packed orientations": (with_chunks(*[_chunk(b"iTXt", xmp)] * 200), True),
         "a text of 2 GiB": (with_chunks(struct.pack(">I", 2**31 - 1) + b"tEXtcomment\0"), False),
         "a hundred thousand empty chunks": (with_chunks(*[_chunk(b"teSt", b"")] * 100_000), True),
         "rows that are not there": (png_of_rows(4000, 4000, 1), False),

@@ -20,7 +20,7 @@ import subprocess
 import numpy as np
 import torch
 from lerobot.policies.common.vla_utils import resize_with_pad, resize_with_pad_torch
-from PIL import Image, ImageOps
+from PIL import Image
 
 TARGETS = [(512, 512), (224, 224), (320, 240), (96, 160), (640, 64)]
 
@@ -39,16 +39,16 @@ class Runtime:
 
 
 def reference(file: bytes, width: int, height: int, how: str) -> np.ndarray:
-    """The pixels as LeRobot sees them: upright RGB, channels first, divided by 255; openpi resizes before it divides."""
-    upright = ImageOps.exif_transpose(Image.open(io.BytesIO(file))).convert("RGB")
+    """The pixels as LeRobot sees them: RGB as stored, channels first, divided by 255; openpi resizes before it divides."""
+    stored = Image.open(io.BytesIO(file)).convert("RGB")
     if how == "pillow":
-        ratio = max(upright.width / width, upright.height / height)
-        size = (int(upright.width / ratio), int(upright.height / ratio))
+        ratio = max(stored.width / width, stored.height / height)
+        size = (int(stored.width / ratio), int(stored.height / ratio))
         # Columns first and then rows, as Pillow did in one call before release 12 and openpi's pinned one does.
-        small = upright.resize((size[0], upright.height), Image.BILINEAR).resize(size, Image.BILINEAR)
-        upright = Image.new("RGB", (width, height), 0)
-        upright.paste(small, ((width - small.width) // 2, (height - small.height) // 2))
-    image = torch.from_numpy(np.array(upright)).permute(2, 0, 1)[None].contiguous().float().div(255)
+        small = stored.resize((size[0], stored.height), Image.BILINEAR).resize(size, Image.BILINEAR)
+        stored = Image.new("RGB", (width, height), 0)
+        stored.paste(small, ((width - small.width) // 2, (height - small.height) // 2))
+    image = torch.from_numpy(np.array(stored)).permute(2, 0, 1)[None].contiguous().float().div(255)
     if how == "center":
         image = resize_with_pad_torch(image, height, width)
     elif not how:

@@ -29,7 +29,7 @@ import numpy as np
 import tokenizers
 import torch
 from bundle_tokenizer import keys_of
-from PIL import Image, ImageOps, PngImagePlugin
+from PIL import Image, PngImagePlugin
 from resize_references import REFERENCES
 from tokenizer_zoo import SENTENCES, ZOO, fuzz_string
 
@@ -115,6 +115,8 @@ def readable_images() -> dict:
     xmp = b'<x:xmpmeta><rdf:Description tiff:Orientation="6"/></x:xmpmeta>'
     text = PngImagePlugin.PngInfo()
     text.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    raw = PngImagePlugin.PngInfo()
+    raw.add_text("Raw profile type exif", f"\nexif\n{len(exif_block(8)):8}\n{exif_block(8).hex()}\n", zip=True)
     colours = b"".join(bytes([i * 60, 255 - i * 60, i * 17]) for i in range(4))
     images = {
         "rgb.png": saved(rgb, "PNG"),
@@ -140,6 +142,8 @@ def readable_images() -> dict:
         "restart.jpg": saved(soft, "JPEG", restart_marker_rows=1),
         "stored_as_rgb.jpg": saved(soft, "JPEG", keep_rgb=True),
         "xmp.jpg": saved(soft, "JPEG", xmp=xmp),
+        "exif_broken.jpg": saved(soft, "JPEG", exif=b"Exif\0\0nothing of the kind"),
+        "exif_as_text.png": saved(rgb, "PNG", pnginfo=raw),
         "exif_unknown.jpg": saved(soft, "JPEG", exif=b"Exif\0\0" + exif_block(9)),
         "exif_before_xmp.jpg": saved(soft, "JPEG", exif=b"Exif\0\0" + exif_block(3), xmp=xmp),
         "one_pixel.jpg": saved(soft.crop((0, 0, 1, 1)), "JPEG"),
@@ -152,8 +156,6 @@ def readable_images() -> dict:
 def refused_images() -> dict:
     rgb, soft = Image.fromarray(image(13, 9)), Image.fromarray(smooth(21, 17))
     whole, jpeg = saved(rgb, "PNG"), saved(soft, "JPEG")
-    raw = PngImagePlugin.PngInfo()
-    raw.add_text("Raw profile type exif", f"\nexif\n{len(exif_block(8)):8}\n{exif_block(8).hex()}\n", zip=True)
     return {
         "bad_16_bit.png": png(2, 1, 16, 0, b"\0" + bytes(4)),
         "bad_16_bit_rgb.png": png(1, 1, 16, 2, b"\0" + bytes(6)),
@@ -161,14 +163,12 @@ def refused_images() -> dict:
         "bad_no_end.png": whole[:-12],
         "bad_checksum.png": whole[:60] + bytes([whole[60] ^ 1]) + whole[61:],
         "bad_palette_index.png": png(2, 1, 8, 3, b"\0\0\5", [(b"PLTE", bytes(6))]),
-        "bad_raw_profile.png": saved(rgb, "PNG", pnginfo=raw),
         "bad_few_rows.png": png(2, 4, 8, 0, b"\0\1\2"),
         "bad_huge.png": png(20000, 20000, 8, 2, b""),
         "bad_truncated.jpg": jpeg[: len(jpeg) * 2 // 3],
         "bad_no_end.jpg": jpeg[:-2],
         "bad_header_only.jpg": jpeg[:20],
         "bad_cmyk.jpg": saved(soft.convert("CMYK"), "JPEG"),
-        "bad_exif.jpg": saved(soft, "JPEG", exif=b"Exif\0\0nothing of the kind"),
         "bad_huge.jpg": jpeg.replace(struct.pack(">HH", 17, 21), struct.pack(">HH", 20000, 20000)),
     }
 
@@ -180,7 +180,7 @@ def write_images() -> None:
         (folder / name).write_bytes(data)
     for name, data in readable_images().items():
         image = Image.open(io.BytesIO(data))
-        pixels = np.array(ImageOps.exif_transpose(image).convert("RGB"))
+        pixels = np.array(image.convert("RGB"))
         np.save(folder / (name + ".npy"), pixels)
 
 

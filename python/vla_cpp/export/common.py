@@ -31,13 +31,13 @@ def picture_file(image: Tuple[str, Any]) -> Tuple[str, bytes]:
 
 
 def pixels(image: Tuple[str, Any]) -> np.ndarray:
-    """uint8 (height, width, 3), upright as the policy saw it."""
+    """uint8 (height, width, 3), as the policy saw it."""
     kind, data = image
     if kind == "rgb":
         return data
-    from PIL import Image, ImageOps
+    from PIL import Image
 
     try:
-        return np.asarray(ImageOps.exif_transpose(Image.open(io.BytesIO(data))).convert("RGB"))
+        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
     except OSError as problem:
         raise BadRequest("a recorded image", f"a {kind} file", str(problem)) from None
