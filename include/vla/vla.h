@@ -166,6 +166,8 @@ struct vla_description {
    * leftover are then theirs alone: here they are 0 and empty. */
   size_t n_embodiment;
   const vla_description* const* embodiments;
+  size_t n_action_steps; /* rows of a chunk that the checkpoint executes before it looks again; 0 where the bundle does
+                            not state it */
 };
 
 /* NULL only when `policy` is NULL. */

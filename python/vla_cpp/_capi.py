@@ -104,6 +104,7 @@ class Description(_Struct):
         ("embodiment", c_char_p),
         ("n_embodiment", c_size_t),
         ("embodiments", POINTER(c_void_p)),  # of Description
+        ("n_action_steps", c_size_t),
     ]
 
 

@@ -288,3 +288,4 @@ def _spec_of(d: _capi.Description) -> Spec:
         embodiment=_text(d.embodiment),
         robots={robot.embodiment: robot for robot in robots},
     )
+        n_action_steps=d.n_action_steps,

@@ -12,13 +12,15 @@ from .printable import printable
 
 @dataclass(frozen=True)
 class ViewSpec:
-    """A camera. width, height: pixels that the network sees; frames of any size are letterboxed to it."""
+    """A camera. width, height: pixels that the network sees; frames of any size are letterboxed to it. camera: width and height of the
+    frames that the checkpoint states, 0 where it states none or `Policy` describes it."""
 
     name: str
     optional: bool
     width: int
     height: int
     aliases: Tuple[str, ...] = ()
+    camera: Tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Spec:
     robots        of a policy with several: each one's own Spec by its tag. Views, states, actions, horizon and noise are then theirs
                   alone, and empty here
     rate_hz       rows per second that the policy was trained for; 0 where the bundle does not say
+    n_action_steps  rows of a chunk that the checkpoint executes before it looks again; 0 where the bundle does not say
     """
 
     views: Tuple[ViewSpec, ...]
@@ -85,6 +88,7 @@ class Spec:
     real_time_chunking: str = ""
     embodiment: str = ""
     robots: Mapping[str, Spec] = field(default_factory=dict)
+    n_action_steps: int = 0
 
     def __repr__(self) -> str:
         robot = f", robot {self.embodiment}" if self.embodiment else ""
@@ -93,6 +97,7 @@ class Spec:
         lines += [f"  state   {s.name}, {s.width} values{_named(s.names, s.units)}" for s in self.states]
         if self.horizon:
             rate = f" at {self.rate_hz:g} Hz" if self.rate_hz else ""
+            rate += f", {self.n_action_steps} executed" if self.n_action_steps else ""
             lines.append(f"  action  {self.horizon} rows{rate} of {self.d_action} values{_named(self.action_names, self.action_units)}")
             lines.append(f"  noise   {self.noise}, {self.noise_rows} x {self.d_noise}")
         if self.real_time_chunking:

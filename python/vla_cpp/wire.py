@@ -26,7 +26,7 @@ PROTOCOL_VERSION = 1
 DESCRIPTOR = Path(__file__).with_name("vla.desc")
 MAX_PARTS = 1 << 16  # messages and texts of one answer
 MAX_NOISE = 1 << 22  # numbers of one act's noise
-_MOST = {"horizon": 1 << 16, "noise_rows": 1 << 16, "d_noise": 1 << 16, "rate_hz": 1e6}  # numbers of a description
+_MOST = {"horizon": 1 << 16, "n_action_steps": 1 << 16, "noise_rows": 1 << 16, "d_noise": 1 << 16, "rate_hz": 1e6}  # numbers of a description
 
 
 def _load_messages() -> Dict[str, Any]:
@@ -196,7 +196,10 @@ def spec_of(description: Any) -> Spec:
         raise Incompatible("description", f"noise of up to {MAX_NOISE} numbers", f"{description.noise_rows} x {description.d_noise}")
     runtime = description.runtime
     return Spec(
-        views=tuple(ViewSpec(printable(v.name), v.optional, v.width, v.height, _texts(v.aliases)) for v in description.views),
+        views=tuple(
+            ViewSpec(printable(v.name), v.optional, v.width, v.height, _texts(v.aliases), (v.camera_width, v.camera_height))
+            for v in description.views
+        ),
         min_views=description.min_views,
         states=tuple(
             StateSpec(
@@ -214,6 +217,7 @@ def spec_of(description: Any) -> Spec:
         real_time_chunking=printable(description.real_time_chunking),
         embodiment=printable(description.embodiment),
         robots={printable(robot.embodiment): spec_of(robot) for robot in description.embodiments},
+        n_action_steps=description.n_action_steps,
         rate_hz=description.rate_hz,
         bundle=bundle_of(description.bundle),
         precision=printable(runtime.precision),

@@ -107,7 +107,9 @@ void print_features(const Description& d, const Robot& robot) {
   say(stdout, "views        any size, {} to {} x {}; at least {} of {} must be present\n", recipe.fit->described(),
       recipe.width, recipe.height, d.min_views, d.views.size());
   for (const auto& view : d.views)
-    say(stdout, "    {}{}\n", view.name, view.alias.empty() ? "" : fmt::format("  (also {})", view.alias));
+    say(stdout, "    {}{}{}\n", view.name, view.alias.empty() ? "" : fmt::format("  (also {})", view.alias),
+        view.camera_width > 0 ? fmt::format("  the checkpoint's is {} x {}", view.camera_width, view.camera_height)
+                              : "");
   for (const auto& state : d.states) {
     say(stdout, "state        {}, {} numbers\n", state.name, state.numbers.size());
     print_numbers(state.numbers, read_stats(robot.bundle(), state.name));
@@ -115,6 +117,9 @@ void print_features(const Description& d, const Robot& robot) {
   say(stdout, "action       {} rows of {} numbers{}\n", d.horizon, d.actions.size(),
       d.rate_hz > 0 ? fmt::format(", {:g} rows a second", d.rate_hz) : ", control rate unstated");
   print_numbers(d.actions, read_stats(robot.bundle(), "action"));
+  if (d.n_action_steps > 0)
+    say(stdout, "executed     {} rows of a chunk before the next look (n_action_steps of the checkpoint)\n",
+        d.n_action_steps);
   if (d.max_text_tokens > 0)
     say(stdout, "instruction  at most {} tokens\n", d.max_text_tokens);
   else
@@ -171,6 +176,9 @@ void print_human(const Engine& engine) {
   say(stdout, "solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);
   say(stdout, "leftover     {}\n",
       d.real_time_chunking.empty() ? "refused: no real-time chunking" : d.real_time_chunking);
+  if (d.rtc.execution_horizon > 0)
+    say(stdout, "rtc          the checkpoint executes {} rows, schedule {}, max guidance {:g}\n",
+        d.rtc.execution_horizon, d.rtc.schedule, d.rtc.max_guidance);
   const Json recipe = Json::parse(*robot.bundle().keys().string("processor.recipe"), nullptr, false);
   for (const auto& [list, ops] : recipe.items()) {
     say(stdout, "recipe       {}\n", list);

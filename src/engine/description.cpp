@@ -4,6 +4,8 @@
 
 #include <fmt/format.h>
 
+#include "bundle/run_keys.h"
+
 namespace vla {
 namespace {
 
@@ -25,9 +27,17 @@ Description describe(const Engine& engine, const Robot& robot) {
 
   const auto aliases = texts("observation.view_aliases");
   const auto optional = *keys.integers("observation.view_optional", kFlag);
+  const std::vector<int> cameras =
+      keys.has(kCameraSizes) ? *keys.integers(kCameraSizes, kCameraSide) : std::vector<int>(2 * aliases.size());
   const Recipe& recipe = processor.recipe();
   for (std::size_t i = 0; i < aliases.size(); ++i)
-    out.views.push_back({processor.views().names()[i], aliases[i], optional[i] != 0, recipe.width, recipe.height});
+    out.views.push_back({.name = processor.views().names()[i],
+                         .alias = aliases[i],
+                         .optional = optional[i] != 0,
+                         .width = recipe.width,
+                         .height = recipe.height,
+                         .camera_width = cameras[2 * i],
+                         .camera_height = cameras[2 * i + 1]});
   out.min_views = processor.min_views();
 
   const auto names = texts("observation.state_names"), units = texts("observation.state_units");
@@ -41,6 +51,11 @@ Description describe(const Engine& engine, const Robot& robot) {
 
   out.horizon = robot.horizon();
   out.actions = numbers(processor.action_names(), texts("action.units"), 0, processor.action_names().size());
+  out.n_action_steps = keys.has(kActionSteps) ? *keys.integer(kActionSteps, {1, kMaxVector}) : 0;
+  out.rtc = {};
+  if (keys.has(kRtcHorizon))
+    out.rtc = {*keys.integer(kRtcHorizon, {1, kMaxVector}), *keys.string(kRtcSchedule),
+               *keys.number(kRtcGuidance, {0, 1e9})};
   out.rate_hz = *keys.number("action.rate_hz", kRateHz);
   out.solver_horizon = robot.solver_horizon();
   out.d_action_padded = robot.d_action_padded();

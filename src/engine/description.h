@@ -12,9 +12,10 @@ namespace vla {
 /// Inputs and outputs of a loaded policy, for printing and sending.
 struct Description {
   struct View {
-    std::string name, alias;  // the alias is empty if there is none
-    bool optional;            // an observation without it declares it absent
-    int width, height;        // pixels that the network sees; frames of any size are fitted
+    std::string name, alias;          // the alias is empty if there is none
+    bool optional;                    // an observation without it declares it absent
+    int width, height;                // pixels that the network sees; frames of any size are fitted
+    int camera_width, camera_height;  // of the frames that the checkpoint states; 0 if it states none
   };
   struct Number {
     std::string name, unit;  // the unit is empty if the bundle does not state it
@@ -32,10 +33,17 @@ struct Description {
   int horizon;  // rows of a chunk
   std::vector<Number> actions;
   double rate_hz;                       // rows per second, 0 if the bundle does not state it
+  int n_action_steps;                   // rows that the checkpoint executes before it looks again; 0 if unstated
   int solver_horizon, d_action_padded;  // rows and columns of the solver's start; a chunk has the first of them
   std::string solver, noise;            // kinds
   int n_step;
   double t_start;
+  /// The checkpoint's settings of real-time chunking; a horizon of 0 if it states none.
+  struct Rtc {
+    int execution_horizon;  // rows of a chunk that are executed
+    std::string schedule;
+    double max_guidance;  // 0 if unstated
+  } rtc;
   std::string real_time_chunking;  // how an act uses a leftover: guided, inpainted, or empty if it is refused
 
   std::string embodiment;  // the robot's tag, empty if the bundle is for one robot without a name

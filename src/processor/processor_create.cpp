@@ -9,6 +9,7 @@
 #include <numeric>
 #include <set>
 
+#include "bundle/run_keys.h"
 #include "processor/ops/text.h"
 #include "processor/processor.h"
 
@@ -122,8 +123,18 @@ Status Processor::check_descriptions(const Keys& keys) const {
   VLA_CHECK(check_size("action.units", action_units, action_names_.size()));
   VLA_CHECK(check_size("observation.state_names", state_names, n_state));
   VLA_CHECK(check_size("observation.state_units", state_units, n_state));
-  const auto rate = keys.number("action.rate_hz", kRateHz);
-  return rate ? Status() : Status(rate.error());
+  if (const auto rate = keys.number("action.rate_hz", kRateHz); !rate) return rate.error();
+  if (keys.has(kCameraSizes)) {
+    VLA_TRY(const auto sides, keys.integers(kCameraSizes, kCameraSide));
+    VLA_CHECK(check_size(kCameraSizes, sides, 2 * views_.names().size()));
+  }
+  if (keys.has(kActionSteps))
+    if (const auto steps = keys.integer(kActionSteps, {1, kMaxVector}); !steps) return steps.error();
+  if (!keys.has(kRtcHorizon)) return {};
+  if (const auto horizon = keys.integer(kRtcHorizon, {1, kMaxVector}); !horizon) return horizon.error();
+  if (const auto schedule = keys.string(kRtcSchedule); !schedule) return schedule.error();
+  const auto guidance = keys.number(kRtcGuidance, {0, 1e9});
+  return guidance ? Status() : Status(guidance.error());
 }
 
 Status Processor::read_degraded(const Keys& keys) {

@@ -9,6 +9,9 @@ void keep_interface(v1::Description& description) {
   description.clear_bundle();
   description.clear_runtime();
   description.clear_limits();
+  description.clear_n_action_steps();  // how a policy is run, not what it takes and gives
+  description.clear_rtc();
+  for (v1::ViewSpec& view : *description.mutable_views()) view.clear_camera_width(), view.clear_camera_height();
   description.clear_policy();
   description.clear_policies();
   for (v1::Description& robot : *description.mutable_embodiments()) keep_interface(robot);

@@ -305,11 +305,32 @@ def test_arguments_that_make_no_sense_are_refused_by_name(clock, changed, where)
     assert caught.value.where == where
 
 
-@pytest.mark.parametrize("missing", ["rate_hz", "replan_every", "mode", "blend", "on_late", "on_note"])
+@pytest.mark.parametrize("missing", ["mode", "blend", "on_late", "on_note"])
 def test_what_changes_the_motion_has_no_default(clock, missing):
     arguments = {k: v for k, v in ARGUMENTS.items() if k != missing}
     with pytest.raises(TypeError, match=missing):
         ChunkLoop(Remote(clock), **arguments)
+
+
+def test_rate_and_interval_are_what_the_bundle_says_and_told(clock, caplog):
+    policy = Remote(clock)
+    policy.spec = dataclasses.replace(SPEC, n_action_steps=3)
+    loop = loop_of(policy, clock, rate_hz=None, replan_every=None, mode="sync")
+    assert loop.rate_hz == 10.0
+    assert [record.getMessage() for record in caplog.records] == ["rate_hz=10, as b says", "replan_every=3, as b says"]
+    run(loop, 7)
+    assert len(policy.seen) == 3
+    caplog.clear()
+    loop_of(policy, clock, replan_every=4)
+    assert [record.getMessage() for record in caplog.records] == ["replan_every=4, where b says 3"]
+
+
+@pytest.mark.parametrize("missing", ["rate_hz", "replan_every"])
+def test_what_neither_the_caller_nor_the_bundle_says_is_asked_for(clock, missing):
+    policy = Remote(clock)
+    policy.spec = dataclasses.replace(SPEC, rate_hz=0.0)
+    with pytest.raises(UsageError, match="since the bundle does not say"):
+        loop_of(policy, clock, **{missing: None})
 
 
 def test_another_rate_must_be_meant(clock):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 import warnings
@@ -23,6 +24,7 @@ Observation = Union[Mapping[str, Any], Callable[[], Mapping[str, Any]]]
 # What another observation may well survive. Everything else would come again, and is raised.
 PASSING = (Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout)
 ACT_DECAY = 0.01
+LOG = logging.getLogger("vla_cpp.control")
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,9 @@ class ChunkLoop:
 
     policy        vla_cpp.Client, vla_cpp.Policy, or anything with their `spec` and `act`
     rate_hz       control periods per second; must be what the policy was trained for, where its bundle says, unless
-                  allow_other_rate is set
-    replan_every  rows of a chunk that are commanded before the next observation is taken
+                  allow_other_rate is set. None: what the bundle says
+    replan_every  rows of a chunk that are commanded before the next observation is taken. None: the checkpoint's n_action_steps, where
+                  its bundle says. What is taken from the bundle is told in the log "vla_cpp.control", and so is another number
     mode          "sync": `step` waits for the chunk; the robot stands meanwhile. "async": the chunk is computed while rows of the
                   one before are commanded, and those rows of it that are past when it comes are skipped. "rtc": as "async", and the
                   policy goes on from the rows of the one before that are not commanded yet
@@ -78,8 +81,8 @@ class ChunkLoop:
         self,
         policy: Any,
         *,
-        rate_hz: float,
-        replan_every: int,
+        rate_hz: Optional[float] = None,
+        replan_every: Optional[int] = None,
         mode: str,
         blend: Union[str, Blend],
         on_late: Union[str, OnLate],
@@ -99,9 +102,11 @@ class ChunkLoop:
             raise UsageError("rtc", 'a RealTimeChunking with the mode "rtc", and only there', repr(rtc))
         if on_note not in ("ignore", "warn", "raise"):
             raise UsageError("on_note", '"ignore", "warn" or "raise"', repr(on_note))
+        spec = policy.spec
+        rate_hz = _stated("rate_hz", rate_hz, spec.rate_hz, spec.bundle.name)
+        replan_every = _stated("replan_every", replan_every, getattr(spec, "n_action_steps", 0), spec.bundle.name)
         if not 0 < rate_hz < math.inf:
             raise UsageError("rate_hz", "periods per second, above 0", str(rate_hz))
-        spec = policy.spec
         if spec.rate_hz > 0 and abs(spec.rate_hz - rate_hz) > 1e-6 * rate_hz and not allow_other_rate:
             hint = "a robot at another rate moves at another speed; allow_other_rate=True if that is meant"
             raise UsageError("rate_hz", f"{spec.rate_hz:g}, that of {spec.bundle.name}", f"{rate_hz:g}", hint)
@@ -251,6 +256,18 @@ class ChunkLoop:
         self.last_error = error
         if not isinstance(error, PASSING):
             raise error
+
+
+def _stated(name: str, given: Any, stated: float, bundle: str) -> Any:
+    """What the caller gives, or else what the bundle says: the one and a difference are told. Errors: UsageError where neither says."""
+    if given is None:
+        if not stated > 0:
+            raise UsageError(name, "a number, since the bundle does not say", "none")
+        LOG.warning("%s=%g, as %s says", name, stated, bundle)
+        return stated
+    if stated > 0 and given != stated:
+        LOG.warning("%s=%g, where %s says %g", name, given, bundle, stated)
+    return given
 
 
 def _snapshot(value: Any) -> Any:

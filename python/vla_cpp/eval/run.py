@@ -7,10 +7,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Callable, Dict, Iterator, List, Optional
 
+from ..output import write_text
 from . import report
 from .environment import Environment, Guard
 from .environments import find, make
@@ -117,12 +119,15 @@ def run(
     options = options_of(find(name), a.spec)
     declaration = find(name).declare(jobs[0].task, **options)
     size_random([a, b], declaration.d_action)
-    replan_every = replan_every or declaration.replan_every
+    stated = getattr(a.spec, "n_action_steps", 0) if a.spec else 0
+    replan_every = _replan_every(replan_every, stated, declaration.replan_every)
     head = {
         "environment": name, "a": a.label, "a_identity": a.identity, "b": b.label if b else "", "b_identity": b.identity if b else "",
         "replan_every": replan_every, "limit": "by suite" if find(name).suites() else declaration.limit,
         "rate_hz": declaration.rate_hz, "conventions": declaration.conventions,
     }  # fmt: skip
+    if stated:
+        head["n_action_steps"] = stated
     drivers = {"a": a.description, **({"b": b.description} if b else {})}
     plan = Plan(name, options, drivers, "b" if b else None, replan_every, mode, latency_ms / 1e3)
     if not plan.waits:
@@ -136,6 +141,15 @@ def run(
     # In the order of the jobs, not in that in which workers finished them: a table must not depend on who was faster.
     finished = {row.key: row for row in journal.outcomes}
     return report.summary([finished[job.key] for job in jobs], head)
+
+
+def _replan_every(asked: int, stated: int, usual: int) -> int:
+    """Steps executed of a chunk: asked for, or what the checkpoint executes, or the environment's usual number. Told, since success hangs on it."""
+    chosen = asked or stated or usual
+    if stated:
+        why = "as the checkpoint" if chosen == stated else f"where the checkpoint executes {stated}: n_action_steps"
+        print(f"steps executed of a chunk: {chosen}, {why}", file=sys.stderr)
+    return chosen
 
 
 def size_random(drivers: List[Optional[Driver]], d_action: int) -> None:
@@ -196,8 +210,8 @@ def film_episodes(name: str, driver: Driver, rows: List[Outcome], folder: Path, 
 
 def write_report(data: Dict[str, Any], folder: Path) -> None:
     """summary.json, summary.md and, with matplotlib, summary.png."""
-    (folder / "summary.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-    (folder / "summary.md").write_text(report.markdown(data), encoding="utf-8")
+    write_text(folder / "summary.json", json.dumps(data, indent=1) + "\n")
+    write_text(folder / "summary.md", report.markdown(data))
     try:
         from . import plots
     except ImportError:

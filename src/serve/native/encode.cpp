@@ -31,6 +31,8 @@ void write_features(const Description& d, v1::Description& out) {
     spec.set_optional(view.optional);
     spec.set_width(u32(view.width));
     spec.set_height(u32(view.height));
+    spec.set_camera_width(u32(view.camera_width));
+    spec.set_camera_height(u32(view.camera_height));
   }
   out.set_min_views(u32(d.min_views));
   for (const Description::State& state : d.states) {
@@ -66,6 +68,12 @@ void write_robot(const Description& d, v1::Description& out) {
   write_features(d, out);
   out.set_horizon(u32(d.horizon));
   out.set_rate_hz(d.rate_hz);
+  out.set_n_action_steps(u32(d.n_action_steps));
+  if (d.rtc.execution_horizon > 0) {
+    out.mutable_rtc()->set_execution_horizon(u32(d.rtc.execution_horizon));
+    out.mutable_rtc()->set_schedule(d.rtc.schedule);
+    out.mutable_rtc()->set_max_guidance(d.rtc.max_guidance);
+  }
   out.set_d_noise(u32(d.d_action_padded));
   out.set_noise_rows(u32(d.solver_horizon));
   out.set_noise_kind(d.noise);
