@@ -9,7 +9,7 @@ import random
 import threading
 import time
 from dataclasses import replace
-from typing import Any, Callable, Dict, Mapping, Optional, Union
+from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Union
 
 import zmq
 from google.protobuf.message import DecodeError
@@ -21,7 +21,7 @@ from .connection import Connection, curve_keys
 from .errors import Disconnected, Incompatible, Timeout, UsageError, VlaError
 from .frozen import CameraWatch
 from .handle import Handle, wrong_process
-from .observation import Image, Leftover, State, check_start, robot_of
+from .observation import Image, Leftover, State, check_absent, check_start, robot_of, with_absent
 from .pending import Health, Pending
 from .printable import printable
 from .spec import Spec
@@ -39,6 +39,7 @@ class Client(Handle):
     timeout             seconds that a call may take, connecting included
     server_key          for a server with CURVE: its public key, and with it
     secret_key          this client's secret key: 40 characters each, or the files of `vla keygen` (server.public, robot.secret)
+    absent              views that the robot does not have, as `["camera3"]`: no `act` needs to say so, and none may give an image of one
 
     The first call connects. When the server goes away, or does not answer in time, the call raises and the next one reconnects,
     so that a program survives a restart of its server; a server that comes back with other weights is refused with Incompatible.
@@ -55,12 +56,13 @@ class Client(Handle):
         timeout: float = 10.0,
         server_key: Union[str, os.PathLike, None] = None,
         secret_key: Union[str, os.PathLike, None] = None,
+        absent: Sequence[str] = (),
     ) -> None:
         if not timeout > 0:
             raise UsageError("timeout", "seconds above 0", str(timeout))
         if (server_key is None) != (secret_key is None):
             raise UsageError("CURVE", "server_key and secret_key", "one of them")
-        self.address, self.policy, self.timeout = address, policy, timeout
+        self.address, self.policy, self.timeout, self._absent = address, policy, timeout, tuple(absent)
         self._curve = curve_keys(server_key, secret_key) if server_key is not None and secret_key is not None else None
         self._pid = os.getpid()
         self._lock = threading.RLock()
@@ -140,6 +142,10 @@ class Client(Handle):
         deadline_ms = timeout * 1000 if deadline_ms is None else deadline_ms
         begun = time.monotonic()
         spec, limits = robot_of(self._spec or self._learn(timeout), embodiment), self._limits
+
+        if self._absent:
+            check_absent(self._absent, self.spec)
+            observation["images"] = with_absent(observation.get("images", {}), self._absent, spec.views)
 
         def write(request: Any) -> bytes:
             request.act.policy = self.policy or ""

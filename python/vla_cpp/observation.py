@@ -62,6 +62,27 @@ def place(kind: str, given: str, features: Sequence[Union[ViewSpec, StateSpec]])
     return found[0] if len(found) == 1 else f'{kind} "{given}"'
 
 
+def check_absent(absent: Sequence[str], spec: Spec) -> Tuple[str, ...]:
+    """The views that a robot does not have. Errors: UsageError for a name that is no view of the policy."""
+    views = [view for robot in ([*spec.robots.values()] or [spec]) for view in robot.views]
+    for name in absent:
+        if place("view", name, views) not in [view.name for view in views]:
+            raise UsageError("absent", "views of the policy: " + ", ".join(view.name for view in views), str(name))
+    return tuple(absent)
+
+
+def with_absent(images: Mapping[str, Image], absent: Sequence[str], views: Sequence[ViewSpec]) -> Mapping[str, Image]:
+    """The images, beside the views that are absent. Errors: BadObservation for an image of one of them."""
+    if not absent:
+        return images
+    places = {place("view", name, views) for name in absent} & {view.name for view in views}
+    given = {place("view", name, views): image for name, image in named("images", images)}
+    for where in places:
+        if given.get(where) is not None:
+            raise BadObservation(where, "no image: the view was declared absent", "an image")
+    return {**images, **dict.fromkeys(places - set(given))}
+
+
 def image_arg(where: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, None]]:
     """("rgb", contiguous uint8 array (height, width, 3)), ("jpeg" or "png", the file's bytes), or ("absent", None)."""
     if image is None:

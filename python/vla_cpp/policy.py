@@ -8,7 +8,7 @@ import ctypes
 import os
 import random
 import threading
-from typing import Any, List, Mapping, Optional, Tuple, Type, Union
+from typing import Any, List, Mapping, Optional, Sequence, Tuple, Type, Union
 
 import numpy as np
 
@@ -17,7 +17,9 @@ from .chunk import Chunk
 from .errors import BadObservation, UsageError, VlaError, error_of
 from .frozen import CameraWatch
 from .handle import Handle, wrong_process
-from .observation import Image, Leftover, State, check_start, image_arg, leftover_of, named, noise_of, place, robot_of, states_of
+from .observation import (
+    Image, Leftover, State, check_absent, check_start, image_arg, leftover_of, named, noise_of, place, robot_of, states_of, with_absent,
+)  # fmt: skip
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 
@@ -36,6 +38,7 @@ class Policy(Handle):
     strict_state  refuse a state far beyond what the policy has seen (BadObservation) instead of answering with a note
     device   "cpu", "vulkan", "vulkan:1", "cuda", ...; None: "cpu". A device that is absent is a DeviceError, which lists what is there
     embodiment  of a bundle for several robots, the tag of the one to load; None: all of them, and each `act` names its robot
+    absent   views that the robot does not have, as `["camera3"]`: no `act` needs to say so, and none may give an image of one
     memory   bytes that the process may take, or on a GPU the policy of its memory; 0: no limit. Matrices that do not fit stay in
              the file and are read in every act; actions are the same to the bit. Too few are an OutOfMemory that tells how many would do
 
@@ -54,6 +57,7 @@ class Policy(Handle):
         strict_state: bool = False,
         device: Optional[str] = None,
         embodiment: Optional[str] = None,
+        absent: Sequence[str] = (),
         memory: int = 0,
     ) -> None:
         self._handle = ctypes.c_void_p()
@@ -76,6 +80,7 @@ class Policy(Handle):
         if self._library.vla_open(_path_of(path), options, ctypes.byref(self._handle)):
             raise self._last_error(None)
         self._spec = _spec_of(self._library.vla_describe(self._handle).contents)
+        self._absent = check_absent(absent, self._spec)
 
     @property
     def spec(self) -> Spec:
@@ -102,6 +107,7 @@ class Policy(Handle):
         if noise is None and seed is None:
             seed = random.SystemRandom().getrandbits(32)
         spec = robot_of(self._spec, embodiment)
+        images = with_absent(images, self._absent, spec.views)
         call = _Call(spec, images, state, text, seed, noise, leftover)
         notes = self._cameras.notes(spec, images, state)
         with self._lock:
@@ -287,5 +293,5 @@ def _spec_of(d: _capi.Description) -> Spec:
         device=_text(d.device),
         embodiment=_text(d.embodiment),
         robots={robot.embodiment: robot for robot in robots},
-    )
         n_action_steps=d.n_action_steps,
+    )

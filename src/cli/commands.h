@@ -56,6 +56,17 @@ CLI::Option* add_bytes(CLI::App& command, const char* name, Bytes& bytes, const 
 /// The memory that the process may take, or on a GPU the policy, wherever one is loaded.
 void add_memory(CLI::App& command, std::size_t& bytes);
 
+/// The views that the robot does not have, wherever a policy is loaded.
+inline CLI::Option* add_absent(CLI::App& command, std::vector<std::string>& views) {
+  return command
+      .add_option(
+          "--absent", views,
+          "A view of the policy that the robot does not have, as camera3; several times. No observation may have "
+          "it, and none needs to say so")
+      ->type_name("VIEW")
+      ->allow_extra_args(false);
+}
+
 /// Replaces a name `hub:OWNER/NAME@REVISION` by the file that vla-pull has put there; other text names a file. What
 /// comes back is the problem, or empty.
 std::string find_pulled(std::string& bundle);
@@ -76,6 +87,7 @@ Command add_run(CLI::App& app);
 Command add_inspect(CLI::App& app);
 Command add_compare(CLI::App& app);
 Command add_serve(CLI::App& app);
+Command add_check(CLI::App& app);
 Command add_keygen(CLI::App& app);
 Command add_ctl(CLI::App& app);
 Command add_bench(CLI::App& app);

@@ -86,6 +86,7 @@ int run(int argc, char** argv) {
   choose("manual", vla::cli::add_manual(app));
 #ifdef VLA_SERVER
   choose("serve", vla::cli::add_serve(app));
+  choose("check", vla::cli::add_check(app));
   choose("keygen", vla::cli::add_keygen(app));
   choose("ctl", vla::cli::add_ctl(app));
   choose("replay", vla::cli::add_replay(app));

@@ -25,6 +25,7 @@ struct ReplayOptions {
   std::string folder, bundle, kernels, device, embodiment, connect, page;
   double speed = 1;
   int n_thread = 0;
+  std::vector<std::string> absent;
   serve::ReplayOptions replay;
 };
 
@@ -78,6 +79,7 @@ Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOpt
   VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
                                                                         .kernels = options.kernels,
                                                                         .device = options.device,
+                                                                        .absent = options.absent,
                                                                         .embodiment = options.embodiment,
                                                                         .all_robots = true}));
   VLA_CHECK(server->add(recording.description().policy(), std::move(engine)));
@@ -173,6 +175,7 @@ Command add_replay(CLI::App& app) {
       ->needs(bundle);
   add_text(*command, "--device", options->device, "NAME", std::string(kDeviceHelp) + "; with --bundle")->needs(bundle);
   add_text(*command, "--embodiment", options->embodiment, "TAG", "As for vla serve; with --bundle")->needs(bundle);
+  add_absent(*command, options->absent)->needs(bundle);
   command
       ->add_option("--threads", options->n_thread,
                    "CPU threads, with --bundle; 0 takes every core, of big and little ones the big")

@@ -21,7 +21,7 @@ constexpr std::size_t kMaxFile = std::size_t{1} << 30;
 struct RunOptions {
   std::string bundle, text, noise, out, tap, taps_out, inject, kernels, device, leftover, schedule, normalized_out,
       embodiment;
-  std::vector<std::string> images, states;
+  std::vector<std::string> images, states, absent;
   std::optional<std::uint64_t> seed;
   std::optional<int> delay;
   std::optional<double> max_guidance;
@@ -195,6 +195,7 @@ Status run(RunOptions& options) {
                                                                               .device = options.device,
                                                                               .tap_pattern = options.tap,
                                                                               .inject = std::move(inject),
+                                                                              .absent = options.absent,
                                                                               .embodiment = options.embodiment,
                                                                               .memory = options.memory}));
   const Robot& robot = engine->robot();
@@ -258,6 +259,7 @@ Command add_run(CLI::App& app) {
       ->type_name("NAME=FILE")
       ->required()
       ->allow_extra_args(false);
+  add_absent(*command, options->absent);
   command
       ->add_option("--state", options->states, "The robot's state in its own units; NAME= where the policy has several")
       ->type_name("[NAME=]v,v,...")

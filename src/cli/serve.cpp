@@ -179,6 +179,7 @@ Result<serve::LoadedPolicy> load_policy(const ServeOptions& options, std::string
   VLA_TRY(policy.engine, Engine::load(bundle, {.n_thread = options.n_thread,
                                                .kernels = options.kernels,
                                                .device = options.device,
+                                               .absent = options.server.absent,
                                                .embodiment = options.embodiment,
                                                .all_robots = true,
                                                .memory = options.memory}));
@@ -340,6 +341,9 @@ Command add_serve(CLI::App& app) {
       ->allow_extra_args(false)
       ->capture_default_str();
   add_other_protocols(*command, server);
+  add_absent(*command, server.absent);
+  add_text(*command, "--first-frames", server.first_frames, "DIR",
+           "Write what the policy sees of the first act's frames into this folder, as VIEW.png");
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core, of big and little ones the big")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();

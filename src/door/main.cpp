@@ -10,7 +10,6 @@
 #include <charconv>
 #include <cstdio>
 #include <exception>
-#include <sstream>
 
 #include "door/rpcs.h"
 #include "door/sandbox.h"
@@ -91,11 +90,8 @@ class Door final : Link::Handler, Robots::Server {
   }
   void serve(const std::string& map, std::string_view bytes) {
     v1::Description description;
-    std::vector<std::string> lines;
-    std::istringstream in(map);
-    for (std::string line; std::getline(in, line);) lines.push_back(line);
     if (!description.ParseFromArray(bytes.data(), static_cast<int>(bytes.size()))) return broke("");
-    auto names = serve::lerobot::lerobot_names(lines, description);
+    auto names = serve::lerobot::lerobot_names(serve::given_of(map), description);
     if (!names) return broke("");  // the server has checked it
     robots_.serve(std::move(*names), description);
     has_policy_ = true;

@@ -26,14 +26,13 @@ Description describe(const Engine& engine, const Robot& robot) {
   Description out;
 
   const auto aliases = texts("observation.view_aliases");
-  const auto optional = *keys.integers("observation.view_optional", kFlag);
+  const Recipe& recipe = processor.recipe();
   const std::vector<int> cameras =
       keys.has(kCameraSizes) ? *keys.integers(kCameraSizes, kCameraSide) : std::vector<int>(2 * aliases.size());
-  const Recipe& recipe = processor.recipe();
   for (std::size_t i = 0; i < aliases.size(); ++i)
     out.views.push_back({.name = processor.views().names()[i],
                          .alias = aliases[i],
-                         .optional = optional[i] != 0,
+                         .optional = processor.is_optional(i),
                          .width = recipe.width,
                          .height = recipe.height,
                          .camera_width = cameras[2 * i],
@@ -51,12 +50,12 @@ Description describe(const Engine& engine, const Robot& robot) {
 
   out.horizon = robot.horizon();
   out.actions = numbers(processor.action_names(), texts("action.units"), 0, processor.action_names().size());
+  out.rate_hz = *keys.number("action.rate_hz", kRateHz);
   out.n_action_steps = keys.has(kActionSteps) ? *keys.integer(kActionSteps, {1, kMaxVector}) : 0;
   out.rtc = {};
   if (keys.has(kRtcHorizon))
     out.rtc = {*keys.integer(kRtcHorizon, {1, kMaxVector}), *keys.string(kRtcSchedule),
                *keys.number(kRtcGuidance, {0, 1e9})};
-  out.rate_hz = *keys.number("action.rate_hz", kRateHz);
   out.solver_horizon = robot.solver_horizon();
   out.d_action_padded = robot.d_action_padded();
   out.solver = *keys.string("solver.kind");

@@ -48,6 +48,17 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   return engine;
 }
 
+/// Declares the view absent for every robot that has it.
+Status Engine::declare_absent(const std::string& view) {
+  bool is_known = false;
+  for (const auto& robot : robots_) {
+    if (!robot->processor().views().find(view)) continue;
+    is_known = true;
+    VLA_CHECK(robot->declare_absent(view));
+  }
+  return is_known ? Status() : robots_.front()->declare_absent(view);
+}
+
 /// Opens each robot with the bundle that it would have alone.
 Status Engine::open_robots(Bundle file, const EngineOptions& options) {
   std::vector<std::string> tags = {options.embodiment};
@@ -60,6 +71,7 @@ Status Engine::open_robots(Bundle file, const EngineOptions& options) {
     robots_.push_back(std::move(robot));
   }
   robots_.front()->forget_tokenizer();  // the other robots were compared with it
+  for (const std::string& view : options.absent) VLA_CHECK(declare_absent(view));
   return {};
 }
 

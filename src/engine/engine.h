@@ -23,9 +23,10 @@ struct EngineOptions {
   std::string tap_pattern;  // empty: nothing is recorded
   /// Values that replace the computed ones at taps: those of the network, or `pixels` and `state`.
   std::vector<Tap> inject = {};
-  bool dry = false;             // reserve memory without filling it: sizes are exact, and `act` must not be called
-  std::string embodiment = {};  // the robot's tag; empty if the bundle is for one robot
-  bool all_robots = false;      // loads every robot of the bundle; then `embodiment` is empty
+  bool dry = false;  // reserve memory without filling it: sizes are exact, and `act` must not be called
+  std::vector<std::string> absent = {};              // views that no observation will have
+  std::string embodiment = {};                       // the robot's tag; empty if the bundle is for one robot
+  bool all_robots = false;                           // loads every robot of the bundle; then `embodiment` is empty
   std::function<void(const Graph&)> see_graph = {};  // called with the graphs of every plan before they are lowered
   /// Receives values at taps, most of them as soon as they are computed. ActionChunk::taps, which would keep all of
   /// them, stays empty.
@@ -128,6 +129,7 @@ class Engine {
         see_tap_(options.see_tap),
         dry_(options.dry),
         chose_kernels_(!options.kernels.empty()) {}
+  Status declare_absent(const std::string& view);
   Status open_robots(Bundle file, const EngineOptions& options);
   Status take_injected(const std::vector<Tap>& given);
   Status build(const WeightPlan& plan, bool dry);

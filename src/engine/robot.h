@@ -60,6 +60,8 @@ class Robot {
   Status compute_constants(Device& device, bool dry);
   /// Removes keys that were kept to compare later robots with.
   void forget_tokenizer() { bundle_.forget("tokenizer."); }
+  /// Removes a view that this robot does not have from what observations must give. Errors: usage.
+  Status declare_absent(const std::string& view) { return processor_.declare_absent(view); }
   /// Changes the number of solver steps. The robot must have no plans. Errors: bad_bundle, out_of_memory, device.
   Status set_steps(int n_step, Device& device, bool dry);
 

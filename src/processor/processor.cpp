@@ -74,13 +74,26 @@ Result<std::vector<Processor::PresentView>> Processor::present_views(const Obser
     const std::string& name = views_.names()[i];
     if (given[i] == nullptr && view_optional_[i] == 0)
       return bad_observation(name, "an image, or the view declared absent", "neither",
-                             "the bundle's views are " + views_.listed());
+                             "the bundle's views are " + views_.listed() + "; --absent says what the robot lacks");
+    if (given[i] != nullptr && *given[i] && view_absent_[i])
+      return bad_observation(name, "no image: the view was declared absent with --absent", "an image");
     if (given[i] != nullptr && *given[i]) present.push_back({i, &name, &**given[i]});
   }
   if (present.size() < static_cast<std::size_t>(min_views_))
     return bad_observation("views", fmt::format("at least {} of the views {}", min_views_, views_.listed()),
                            fmt::format("{} present", present.size()));
   return present;
+}
+
+Status Processor::declare_absent(const std::string& view) {
+  const auto index = views_.find(view);
+  if (!index) return Error{Code::usage, "--absent", "a view of the policy: " + views_.listed(), view};
+  view_absent_[static_cast<std::size_t>(*index)] = true;
+  view_optional_[static_cast<std::size_t>(*index)] = 1;
+  const auto n_left = std::count(view_absent_.begin(), view_absent_.end(), false);
+  if (n_left >= min_views_) return {};
+  return Error{Code::usage, "--absent", fmt::format("at least {} views left of {}", min_views_, views_.listed()),
+               std::to_string(n_left)};
 }
 
 Status Processor::encode_images(const Observation& observation, Inputs& inputs) const {

@@ -87,7 +87,14 @@ class Processor {
   /// Whether a step of the recipe reads this tensor; any other statistics in a bundle are a mistake.
   bool reads(const std::string& tensor) const;
 
+  /// From now on the robot has no such view: observations need not mention it, and may not give it. Errors: usage, for
+  /// a name that is none of the views, and where fewer would be left than the policy needs.
+  Status declare_absent(const std::string& view);
+
   const FeatureNames& views() const { return views_; }
+  /// Whether an observation may leave this view unmentioned, which declares it absent.
+  bool is_optional(std::size_t view) const { return view_optional_[view] != 0; }
+  bool is_absent(std::size_t view) const { return view_absent_[view]; }
   int min_views() const { return min_views_; }
   const FeatureNames& states() const { return states_; }
   const std::vector<int>& state_dims() const { return state_dims_; }
@@ -123,6 +130,7 @@ class Processor {
 
   FeatureNames views_, states_;
   std::vector<int> view_optional_;  // per view 1 where it may be left unmentioned
+  std::vector<bool> view_absent_;   // of this robot
   int min_views_ = 0;
   std::vector<int> state_dims_;
   std::vector<std::string> state_names_, action_names_, degraded_;

@@ -99,6 +99,7 @@ Status Processor::read_features(const Bundle& bundle) {
   const auto is_missing = [&](const auto& op) { return op->view() >= static_cast<int>(views.size()); };
   if (std::any_of(recipe_.image.begin(), recipe_.image.end(), is_missing))
     return misfit("processor.recipe.image", fmt::format("ops of the {} views", views.size()), "one of a later view");
+  view_absent_.assign(views.size(), false);
   views_ = FeatureNames("view", std::move(views), std::move(aliases));
 
   VLA_TRY(std::vector<std::string> states, keys.strings("observation.states"));

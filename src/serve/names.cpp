@@ -122,18 +122,19 @@ struct Reader {
   Status add_line(const std::string& line) {
     const std::size_t equals = line.find('=');
     if (equals == std::string::npos || equals == 0)
-      return refused("KEY=FEATURE[,bgr][,degrees][,flipped]", "'" + printable(line) + "'");
+      return refused("KEY=FEATURE[,bgr][,degrees][,flipped][,in_order]", "'" + printable(line) + "'");
     const std::string key = line.substr(0, equals);
     std::istringstream words(line.substr(equals + 1));
     std::string feature;
     std::getline(words, feature, ',');
     Convention convention;
     for (std::string word; std::getline(words, word, ',');) {
-      bool* const flag = word == "bgr"       ? &convention.is_bgr
-                         : word == "degrees" ? &convention.is_degrees
-                         : word == "flipped" ? &convention.is_flipped
-                                             : nullptr;
-      if (flag == nullptr) return refused("bgr, degrees or flipped", "'" + printable(word) + "'");
+      bool* const flag = word == "bgr"        ? &convention.is_bgr
+                         : word == "degrees"  ? &convention.is_degrees
+                         : word == "flipped"  ? &convention.is_flipped
+                         : word == "in_order" ? &convention.is_in_order
+                                              : nullptr;
+      if (flag == nullptr) return refused("bgr, degrees, flipped or in_order", "'" + printable(word) + "'");
       *flag = true;
     }
     forget(key);
@@ -142,8 +143,9 @@ struct Reader {
     if (feature.empty()) return names.ignored.push_back({key, {}, {}}), Status();
     const std::string view = features.view(feature), state = features.state(feature);
     if (view.empty() == state.empty()) return refused("the name of one view or state", "'" + printable(feature) + "'");
-    if (view.empty() ? convention.is_bgr : convention.is_degrees || convention.is_flipped)
-      return refused("bgr for a view, degrees and flipped for a state", "'" + printable(line) + "'");
+    if (view.empty() ? convention.is_bgr : convention.is_degrees || convention.is_flipped || convention.is_in_order)
+      return refused("bgr for a view, degrees, flipped and in_order for a state", "'" + printable(line) + "'");
+    VLA_CHECK(check_absent(line, view));
     (view.empty() ? names.states : names.views).push_back({key, view.empty() ? state : view, convention});
     return {};
   }
@@ -156,11 +158,28 @@ struct Reader {
     const auto to = has_colon ? std::from_chars(from.ptr + 1, end, columns.end) : from;
     const auto n = static_cast<std::size_t>(features.description.actions_size());
     if (!has_colon || to.ec != std::errc() || to.ptr != end || columns.begin >= columns.end || columns.end > n ||
-        convention.is_bgr)
+        convention.is_bgr || convention.is_in_order)
       return refused(fmt::format("actions=FROM:TO,degrees or flipped, with 0 <= FROM < TO <= {}", n),
                      "'" + printable(range) + "'");
     names.actions.push_back(columns);
     return {};
+  }
+
+  /// A preset's key for such a view may still come from its robot, and then says that something is wrong.
+  void add_absent(const std::string& given) {
+    const std::string view = features.view(given);
+    if (view.empty()) return;  // of another robot of the bundle: the engine has seen that there is such a view
+    names.absent.push_back(view);
+    std::erase_if(names.views, [&](const Names::Entry& entry) { return entry.feature == view; });
+  }
+
+  bool is_absent(const std::string& view) const {
+    return std::find(names.absent.begin(), names.absent.end(), view) != names.absent.end();
+  }
+
+  Status check_absent(const std::string& line, const std::string& view) const {
+    if (!is_absent(view)) return {};
+    return refused("a view that is not --absent", "'" + printable(line) + "'");
   }
 
   /// Everything that the policy must have comes from a key.
@@ -171,13 +190,16 @@ struct Reader {
     for (const Names::Entry& entry : names.states) covered.insert(entry.feature);
     std::vector<std::string> missing;
     for (const v1::ViewSpec& view : features.description.views())
-      if (!view.optional() && !covered.contains(view.name())) missing.push_back(view.name());
+      if (!view.optional() && !covered.contains(view.name()) && !is_absent(view.name())) missing.push_back(view.name());
     for (const v1::StateSpec& state : features.description.states())
       if (!covered.contains(state.name())) missing.push_back(state.name());
     if (missing.empty()) return std::move(names);
-    return refused(fmt::format("a key of the client for {}", fmt::join(missing, ", ")),
-                   fmt::format("keys {}{}", all_keys(names),
-                               missing_keys.empty() ? std::string() : "; the policy has nothing for " + missing_keys));
+    Error error =
+        refused(fmt::format("a key of the client for {}", fmt::join(missing, ", ")),
+                fmt::format("keys {}{}", all_keys(names),
+                            missing_keys.empty() ? std::string() : "; the policy has nothing for " + missing_keys));
+    error.hint += "; --map KEY=FEATURE names a key, --absent VIEW says that the robot has no such camera";
+    return error;
   }
 };
 
@@ -242,6 +264,7 @@ std::string Names::told() const {
   for (const Columns& columns : actions)
     parts.push_back(
         fmt::format("actions={}:{}({})", columns.begin, columns.end, convention_told(columns.convention, false)));
+  for (const std::string& view : absent) parts.push_back(fmt::format("{}(absent)", last_part(view)));
   std::string out = fmt::format("{}", fmt::join(parts, " "));
   for (const Preset& known : kPresets)
     if (preset == known.name) out = fmt::format("{}: {}; gripper {}", preset, out, known.gripper);
@@ -253,6 +276,28 @@ void Names::to_client(std::vector<float>& values, std::size_t d_action) const {
     for (std::size_t row = 0; row < values.size(); row += d_action)
       for (std::size_t i = columns.begin; i < columns.end; ++i)
         values[row + i] = columns.convention.to_client(values[row + i]);
+}
+
+/// A view begins with what no line begins with.
+std::string text_of(const Given& given) {
+  std::string text;
+  for (const std::string& line : given.lines) text += line + "\n";
+  for (const std::string& view : given.absent) text += "=" + view + "\n";
+  return text;
+}
+
+Given given_of(const std::string& text) {
+  Given given;
+  std::istringstream in(text);
+  for (std::string line; std::getline(in, line);) {
+    const bool is_view = line.starts_with('=');
+    (is_view ? given.absent : given.lines).push_back(is_view ? line.substr(1) : line);
+  }
+  return given;
+}
+
+std::string view_named(const std::string& given, const v1::Description& description) {
+  return Features{description}.view(given);
 }
 
 std::string presets() {
@@ -268,27 +313,29 @@ std::vector<std::string> lines_of(const std::vector<std::string>& lines, bool of
   return some;
 }
 
-Result<Names> names_for(const std::string& preset, const std::vector<std::string>& lines,
-                        const v1::Description& description, const char* option) {
+Result<Names> names_for(const Given& given, const v1::Description& description, const char* option) {
   Reader reader{{}, {description}, option};
-  if (!preset.empty()) {
+  if (!given.preset.empty()) {
     const auto found = std::find_if(std::begin(kPresets), std::end(kPresets),
-                                    [&](const Preset& known) { return preset == known.name; });
-    if (found == std::end(kPresets)) return reader.refused("a preset: " + presets(), "'" + printable(preset) + "'");
+                                    [&](const Preset& known) { return given.preset == known.name; });
+    if (found == std::end(kPresets))
+      return reader.refused("a preset: " + presets(), "'" + printable(given.preset) + "'");
     VLA_CHECK(reader.add_preset(*found));
   }
-  for (const std::string& line : lines) VLA_CHECK(reader.add_line(line));
+  for (const std::string& view : given.absent) reader.add_absent(view);
+  for (const std::string& line : given.lines) VLA_CHECK(reader.add_line(line));
   return reader.finish();
 }
 
-Result<Names> own_names(const std::vector<std::string>& lines, const v1::Description& description, const char* option) {
+Result<Names> own_names(const Given& given, const v1::Description& description, const char* option) {
   Reader reader{{}, {description}, option};
   reader.names.text = "text";
   for (const v1::ViewSpec& view : description.views())
     reader.names.views.push_back({"video." + last_part(view.name()), view.name(), {}});
   for (const v1::StateSpec& state : description.states())
     reader.names.states.push_back({"state." + last_part(state.name()), state.name(), {}});
-  for (const std::string& line : lines) {
+  for (const std::string& view : given.absent) reader.add_absent(view);
+  for (const std::string& line : given.lines) {
     const std::string key = line.substr(0, line.find('='));
     VLA_CHECK(reader.add_line(line));
     // A line for a feature takes the place of the policy's own name for it.
@@ -301,6 +348,18 @@ Result<Names> own_names(const std::vector<std::string>& lines, const v1::Descrip
       });
     }
   }
+  return reader.finish();
+}
+
+Result<Names> native_names(const Given& given, const v1::Description& description) {
+  Reader reader{{}, {description}, "--door native"};
+  if (!given.lines.empty() || !given.preset.empty())
+    return reader.refused("the policy's own names", given.preset.empty() ? "--map" : "--preset");
+  reader.names.text = "text";
+  for (const v1::ViewSpec& view : description.views()) reader.names.views.push_back({view.name(), view.name(), {}});
+  for (const v1::StateSpec& state : description.states())
+    reader.names.states.push_back({state.name(), state.name(), {}});
+  for (const std::string& view : given.absent) reader.add_absent(view);
   return reader.finish();
 }
 
@@ -325,6 +384,7 @@ Result<Observation> observe(const Value& message, const Names& names, const ActL
     return Error{Code::bad_observation, "observation", "a map with the keys " + all_keys(names), "another type"};
   VLA_CHECK(check_keys(message, names));
   Observation observation;
+  for (const std::string& view : names.absent) observation.views.emplace(view, std::nullopt);
   ActLimits left = limits;
   for (const Names::Entry& entry : names.views) {
     const Value* value = at(message, entry.key);

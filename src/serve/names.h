@@ -13,9 +13,10 @@ namespace vla::serve {
 
 /// How a client's values and colours become the policy's, and the policy's actions the client's.
 struct Convention {
-  bool is_bgr = false;      // images: blue comes first
-  bool is_degrees = false;  // the client has degrees where the policy has radians
-  bool is_flipped = false;  // the client has 1 - x, as grippers that count from open to closed
+  bool is_bgr = false;       // images: blue comes first
+  bool is_degrees = false;   // the client has degrees where the policy has radians
+  bool is_flipped = false;   // the client has 1 - x, as grippers that count from open to closed
+  bool is_in_order = false;  // the client's numbers are the policy's one by one, whatever it calls them
 
   float to_policy(float x) const;
   float to_client(float x) const;
@@ -33,6 +34,7 @@ struct Names {
     Convention convention;
   };
   std::vector<Entry> views, states, ignored;  // states of one feature are joined in this order
+  std::vector<std::string> absent;            // views that no observation has
   std::string text = "prompt";                // the key of the instruction
   std::vector<Columns> actions;               // columns whose convention is not the policy's
   std::string preset;                         // empty where only lines say it
@@ -51,15 +53,32 @@ std::string presets();
 /// Picks from lines for all protocols those whose keys are `video.`, `state.` and so on, or the others.
 std::vector<std::string> lines_of(const std::vector<std::string>& lines, bool of_modalities);
 
-/// The names of a preset, which may be empty, with lines `KEY=FEATURE[,bgr][,degrees][,flipped]` that replace and add
-/// to it; `KEY=` lets a key pass without being looked at, `KEY=text` is the instruction's, and `actions=FROM:TO,...`
-/// says conventions of columns of an action. Every view of the policy that an observation must have, and every state,
-/// has to come from a key. `option`: where errors are. Errors: usage, with the keys and the policy's features.
-Result<Names> names_for(const std::string& preset, const std::vector<std::string>& lines,
-                        const v1::Description& description, const char* option);
+/// The full name of a view that is given by any of its names; empty where there is none.
+std::string view_named(const std::string& given, const v1::Description& description);
+
+/// What an operator says of a client's names.
+struct Given {
+  std::string preset;               // may be empty
+  std::vector<std::string> lines;   // of --map
+  std::vector<std::string> absent;  // of --absent: views by any of their names
+};
+
+/// Lines and views as one text, for a process that speaks a protocol, and from it.
+std::string text_of(const Given& given);
+Given given_of(const std::string& text);
+
+/// The names of a preset, which may be empty, with lines `KEY=FEATURE[,bgr][,degrees][,flipped][,in_order]` that
+/// replace and add to it; `KEY=` lets a key pass without being looked at, `KEY=text` is the instruction's, and
+/// `actions=FROM:TO,...` says conventions of columns of an action. Every view of the policy that an observation must
+/// have, and every state, has to come from a key, but for those that are absent. `option`: where errors are. Errors:
+/// usage, with the keys and the policy's features.
+Result<Names> names_for(const Given& given, const v1::Description& description, const char* option);
 
 /// The names of a protocol whose keys are `video.VIEW` and `state.STATE`: the last parts of the policy's own.
-Result<Names> own_names(const std::vector<std::string>& lines, const v1::Description& description, const char* option);
+Result<Names> own_names(const Given& given, const v1::Description& description, const char* option);
+
+/// The names of vla's own clients: the policy's. Errors: usage, for lines and a preset, which they have no use for.
+Result<Names> native_names(const Given& given, const v1::Description& description);
 
 /// An extension of the protocol's own observations: a map {seed, deadline_ms}, both optional integers, which a client
 /// that knows this server may send. Errors: bad_observation.

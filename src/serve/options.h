@@ -25,6 +25,8 @@ struct ServerOptions {
   // Of the protocols that other clients speak (docs/drop_in.md); an empty address: not served.
   std::string openpi, gr00t, lerobot;  // ADDRESS:PORT
   std::string preset;                  // of openpi's clients
+  std::vector<std::string> absent;     // views that the policy was loaded without
+  std::string first_frames;            // a folder for what the policy sees of the first act's frames
   std::vector<std::string> map;        // lines for both; those of GR00T begin with a modality and a dot
   bool vllm_omni = false;              // openpi's clients speak the dialect of vLLM-Omni
   std::string api_token;               // a file

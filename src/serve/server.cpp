@@ -18,6 +18,7 @@
 #include "net/descriptors.h"
 #include "serve/door/front.h"
 #include "serve/double_buffer.h"
+#include "serve/first_frames.h"
 #include "serve/gr00t/front.h"
 #include "serve/lerobot/codec.h"
 #include "serve/native/codec.h"
@@ -46,7 +47,8 @@ const DoorFront::Door kLeRobot{"vla-door-lerobot",
                                &ServerOptions::lerobot,
                                [](const ServerOptions& options, const ServedPolicy& policy) -> Result<std::string> {
                                  VLA_CHECK(check_one_robot(*policy.engine, "--lerobot"));
-                                 VLA_TRY(const Names names, lerobot::lerobot_names(options.map, policy.description));
+                                 const Given given = {{}, options.map, options.absent};
+                                 VLA_TRY(const Names names, lerobot::lerobot_names(given, policy.description));
                                  return names.told();
                                }};
 
@@ -280,6 +282,11 @@ void Server::compute(Act& act) {
 Status Server::prepare(Act& act) const {
   VLA_TRY(act.request, act.answer.job.call->decode(act.policy()));
   act.request.observation.reject_out_of_range = options_.strict_state;
+  if (!options_.first_frames.empty() && !saved_frames_.exchange(true)) {
+    VLA_TRY(const Robot* const robot, act.policy().engine->robot(act.request.observation.embodiment));
+    VLA_TRY([[maybe_unused]] const auto files,
+            save_first_frames(act.request.observation, *robot, options_.first_frames));
+  }
   act.clock.lap(act.answer.stages, "decode");
   const Engine& engine = *act.policy().engine;
   VLA_CHECK(engine.encode(act.request.observation, act.request.noise, act.request.leftover, act.encoded()));

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <atomic>
 #include <memory>
 #include <span>
 #include <string>
@@ -93,7 +94,8 @@ class Server {
   bool records_ = false;  // one of them does
   SeenSizes* sizes_ = nullptr;
   Status lost_device_;
-  Policies policies_;  // of the I/O thread once it runs
+  mutable std::atomic<bool> saved_frames_ = false;  // of the first act
+  Policies policies_;                               // of the I/O thread once it runs
   ServerState state_;
   Exchange exchange_;
   net::Loop loop_;

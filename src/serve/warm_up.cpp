@@ -48,14 +48,15 @@ std::vector<float> state_of(const Robot& robot, const std::string& state, std::s
   return values;
 }
 
-/// An observation of a robot with every view and the longest text.
+/// An observation of a robot with every view that it has and the longest text.
 Observation largest_observation(const Robot& robot, std::uint64_t number) {
   const Processor& processor = robot.processor();
   const Recipe& recipe = processor.recipe();
   const auto [width, height] = recipe.fit->camera_size().value_or(CameraSize{recipe.width, recipe.height});
   const std::vector<std::uint8_t> grey(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3, 128);
   Observation observation;
-  for (const std::string& view : processor.views().names()) observation.views.emplace(view, Frame{width, height, grey});
+  for (std::size_t i = 0; i < processor.views().names().size(); ++i)
+    if (!processor.is_absent(i)) observation.views.emplace(processor.views().names()[i], Frame{width, height, grey});
   for (std::size_t i = 0; i < processor.states().names().size(); ++i)
     observation.states.emplace(
         processor.states().names()[i],

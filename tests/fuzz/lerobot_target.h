@@ -37,7 +37,7 @@ inline bool check_lerobot(std::span<const std::byte> bytes) {
   const Budget budget(5, 256);
   static const v1::Description policy = small_policy();
   static const serve::Names names =
-      *serve::lerobot::lerobot_names({"observation.images.front=wrist,bgr", "actions=0:2,degrees"}, policy);
+      *serve::lerobot::lerobot_names({"", {"observation.images.front=wrist,bgr", "actions=0:2,degrees"}, {}}, policy);
   static const serve::lerobot::Setup known{
       {"arm.0", "arm.1", "hand"}, {{"image", &names.views[0]}, {"wrist", &names.views[1]}}, 2};
   const auto setup = serve::lerobot::read_setup(bytes, names, policy);

@@ -18,8 +18,10 @@ inline v1::Description small_policy() {
     description.add_views()->set_name(view);
   v1::StateSpec& state = *description.add_states();
   state.set_name("state.arm");
-  for (int i = 0; i < 3; ++i) state.add_dimensions()->set_name("arm." + std::to_string(i));
-  for (const char* action : {"arm.0", "arm.1", "hand"}) description.add_actions()->set_name(action);
+  for (const char* joint : {"arm.0", "arm.1", "hand"}) {
+    state.add_dimensions()->set_name(joint);
+    description.add_actions()->set_name(joint);
+  }
   description.set_horizon(2);
   return description;
 }
@@ -66,8 +68,8 @@ inline bool check_openpi(std::span<const std::byte> bytes) {
   const Budget budget(5, 256);
   static const v1::Description policy = small_policy();
   static const serve::Names names = *serve::names_for(
-      "", {"observation/image=image", "observation/wrist_image=wrist,bgr", "observation/state=arm,degrees"}, policy,
-      "");
+      {"", {"observation/image=image", "observation/wrist_image=wrist,bgr", "observation/state=arm,degrees"}, {}},
+      policy, "");
   const auto message = msgpack::read(bytes);
   if (!message) return check_refusal(message.error()), false;
   msgpack::Value omni = *message;

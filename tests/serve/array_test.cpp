@@ -87,7 +87,7 @@ Result<Frame> from_openpi(const std::string& letters, char order, const std::vec
 Result<Frame> from_lerobot(test::PickledArray image) {
   static const v1::Description policy = fuzz::small_policy();
   static const Names names =
-      *lerobot::lerobot_names({"observation.images.image=image", "observation.images.wrist="}, policy);
+      *lerobot::lerobot_names({"", {"observation.images.image=image", "observation.images.wrist="}, {}}, policy);
   static const lerobot::Setup setup{{"arm.0", "arm.1", "hand"}, {{"image", &names.views[0]}}, 2};
   const std::string bytes = test::pickled_observation(image);
   VLA_TRY(const pickle::Pickle message, pickle::Pickle::read(std::as_bytes(std::span(bytes))));

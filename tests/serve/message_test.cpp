@@ -34,7 +34,7 @@ std::string seed_of(const std::string& name) {
 }
 
 serve::Names names(const std::vector<std::string>& lines, const std::string& preset = "") {
-  const auto made = serve::names_for(preset, lines, fuzz::small_policy(), "--openpi");
+  const auto made = serve::names_for({preset, lines, {}}, fuzz::small_policy(), "--openpi");
   REQUIRE_MESSAGE(made.ok(), (made ? "" : made.error().message()));
   return *made;
 }
@@ -196,7 +196,7 @@ TEST_CASE("degrees become radians, a flipped gripper 1 - x, and actions come bac
 
 TEST_CASE("names that leave something out, or that fit nothing, are refused with both lists") {
   const auto refused = [](const std::vector<std::string>& lines, const std::string& preset = "") {
-    const auto made = serve::names_for(preset, lines, fuzz::small_policy(), "--openpi");
+    const auto made = serve::names_for({preset, lines, {}}, fuzz::small_policy(), "--openpi");
     REQUIRE_FALSE(made.ok());
     CHECK(made.error().code == Code::usage);
     CHECK(made.error().hint.find("observation.images.wrist") != std::string::npos);

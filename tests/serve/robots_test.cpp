@@ -39,8 +39,8 @@ class Door : Calls, Robots::Server {
       : robots([] { return Clock::now(); }, {1 << 20, 1 << 20, n_address}, *this, *this) {
     v1::Description description = fuzz::small_policy();
     *description.mutable_limits() = fuzz::small_limits();
-    robots.serve(*lerobot_names({"observation.images.image=image", "observation.images.wrist="}, description),
-                 description);
+    description.mutable_views(1)->set_optional(true);
+    robots.serve(*lerobot_names({"", {"observation.state=arm,in_order"}, {"wrist"}}, description), description);
   }
 
   std::uint64_t connect(const std::string& address) {

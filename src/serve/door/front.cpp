@@ -3,7 +3,6 @@
 #include "serve/door/front.h"
 
 #include <fmt/format.h>
-#include <fmt/ranges.h>
 #include <poll.h>
 
 #include <new>
@@ -11,6 +10,7 @@
 #include "base/out_of_memory.h"
 #include "base/printable.h"
 #include "serve/io.h"
+#include "serve/names.h"
 #include "serve/native/call.h"
 #include "serve/native/codec.h"
 
@@ -101,7 +101,7 @@ void DoorFront::begin(Io& io) {
   io_ = &io;
   if (std::exchange(is_begun_, true)) return;
   link_->start(*this);
-  link_->send(Say::policy, 0, fmt::format("{}", fmt::join(options_.map, "\n")), description_);
+  link_->send(Say::policy, 0, text_of(Given{{}, options_.map, options_.absent}), description_);
   beat();
 }
 

@@ -25,7 +25,10 @@ Kind kind_of(const std::string& endpoint) {
 class Front::Request final : public Call {
  public:
   Request(Front& front, std::uint64_t connection, zmtp::Message message)
-      : front_(front), connection_(connection), envelope_(std::move(message.envelope)), bytes_(std::move(message.bytes)) {}
+      : front_(front),
+        connection_(connection),
+        envelope_(std::move(message.envelope)),
+        bytes_(std::move(message.bytes)) {}
 
   /// The endpoint that it is for. Errors: bad_request, bad_observation.
   Result<std::string> read() {
@@ -94,7 +97,7 @@ Front::Front(net::Loop& loop, const ServerOptions& options, std::string api_toke
 
 Status Front::serve(const ServedPolicy& policy) {
   VLA_CHECK(check_one_robot(*policy.engine, "--gr00t"));
-  VLA_TRY(names_, own_names(lines_of(options_.map, true), policy.description, "--gr00t"));
+  VLA_TRY(names_, own_names({{}, lines_of(options_.map, true), options_.absent}, policy.description, "--gr00t"));
   replaced(policy.description);
   if (options_.gr00t_n1_5) last_ = {msgpack::Framing::npy, true, true, false};
   return {};

@@ -9,6 +9,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <set>
+#include <utility>
 
 #include "base/printable.h"
 #include "serve/lerobot/setup.pb.h"
@@ -61,26 +63,53 @@ const Names::Entry* view_of(const Names& names, std::string_view key) {
   return found == names.views.end() ? nullptr : &*found;
 }
 
+/// The name that a number has where its checkpoint names none.
+std::string placeholder(const v1::StateSpec& state, std::size_t i) {
+  return fmt::format("{}.{}", state.name().substr(state.name().rfind('.') + 1), i);
+}
+
+/// A number of another joint would be taken for this one's without a word: names are compared where the bundle has
+/// them.
+Status check_motors(const std::vector<std::string>& motors, const v1::StateSpec& state, bool is_in_order) {
+  const auto told = [](const std::vector<std::string>& names) {
+    return fmt::format("{}: {}", names.size(), printable(fmt::format("{}", fmt::join(names, ", "))).substr(0, 1000));
+  };
+  std::vector<std::string> own;
+  for (const v1::Dimension& dimension : state.dimensions()) own.push_back(dimension.name());
+  if (motors.size() != own.size())
+    return bad(Code::bad_observation, kState, fmt::format("{} values of the policy's state", own.size()), told(motors));
+  for (std::size_t i = 0; i < own.size() && !is_in_order; ++i)
+    if (!own[i].empty() && own[i] != placeholder(state, i) && own[i] != motors[i])
+      return Error{Code::bad_observation, kState, "the policy's " + told(own), told(motors),
+                   fmt::format("where these are the same joints in the same order, say so at the server: --map {}={},"
+                               "in_order",
+                               kState, state.name())};
+  return {};
+}
+
 }  // namespace
 
-Result<Names> lerobot_names(const std::vector<std::string>& lines, const v1::Description& description) {
+Result<Names> lerobot_names(Given given, const v1::Description& description) {
   if (description.states_size() != 1)
     return Error{Code::usage, "--lerobot", "a policy with one state", fmt::format("{}", description.states_size())};
-  std::vector<std::string> all;
+  const std::vector<std::string> lines = std::exchange(given.lines, {});
+  std::vector<std::string>& all = given.lines;
+  std::set<std::string> absent;
+  for (const std::string& view : given.absent) absent.insert(view_named(view, description));
   const auto is_mapped = [&](const std::string& feature) {
     return std::any_of(all.begin(), all.end(), [&](const std::string& line) {
-      const std::string given = line.substr(line.find('=') + 1);
-      const std::string name = given.substr(0, given.find(','));
+      const std::string words = line.substr(line.find('=') + 1);
+      const std::string name = words.substr(0, words.find(','));
       return name == feature || feature.ends_with("." + name);
     });
   };
   for (const std::string& line : lines)
     if (line.starts_with("observation.") || line.starts_with("actions=")) all.push_back(line);
   for (const v1::ViewSpec& view : description.views())
-    if (!is_mapped(view.name())) all.push_back(view.name() + "=" + view.name());
+    if (!is_mapped(view.name()) && !absent.contains(view.name())) all.push_back(view.name() + "=" + view.name());
   const std::string& state = description.states(0).name();
   if (!is_mapped(state)) all.push_back(std::string(kState) + "=" + state);
-  return names_for("", all, description, "--lerobot");
+  return names_for(given, description, "--lerobot");
 }
 
 Result<Setup> read_setup(std::span<const std::byte> message, const Names& names, const v1::Description& description) {
@@ -93,11 +122,7 @@ Result<Setup> read_setup(std::span<const std::byte> message, const Names& names,
   if (setup.n_action < 1)
     return bad(Code::bad_observation, "actions_per_chunk", "1 or more", std::to_string(setup.n_action));
   VLA_TRY(setup.motors, motors_of(features->find(kState)));
-  if (setup.motors.size() != static_cast<std::size_t>(description.states(0).dimensions_size()))
-    return bad(Code::bad_observation, kState,
-               fmt::format("{} values of the policy's state", description.states(0).dimensions_size()),
-               fmt::format("{}: {}", setup.motors.size(),
-                           printable(fmt::format("{}", fmt::join(setup.motors, ", "))).substr(0, 1000)));
+  VLA_CHECK(check_motors(setup.motors, description.states(0), names.states.front().convention.is_in_order));
   std::vector<std::string> wanted, unknown;
   for (const Names::Entry& entry : names.views) wanted.push_back(entry.key);
   for (std::size_t i = 0; i + 1 < features->items.size(); i += 2) {
@@ -116,6 +141,12 @@ Result<Setup> read_setup(std::span<const std::byte> message, const Names& names,
     return Error{Code::bad_observation, "lerobot_features", fmt::format("cameras of {}", fmt::join(wanted, ", ")),
                  unknown.empty() ? std::string("none") : fmt::format("{}", fmt::join(unknown, ", ")).substr(0, 1000),
                  "name the robot's cameras so, or map them at the server: --map KEY=VIEW"};
+  for (const v1::ViewSpec& view : description.views()) {
+    const auto is_it = [&](const Setup::Camera& camera) { return camera.entry->feature == view.name(); };
+    if (!view.optional() && std::none_of(setup.cameras.begin(), setup.cameras.end(), is_it))
+      return Error{Code::bad_observation, "lerobot_features", "a camera for " + view.name(), "none",
+                   "map one at the server: --map KEY=VIEW; or say there that the robot has none: --absent VIEW"};
+  }
   return setup;
 }
 
@@ -197,6 +228,11 @@ Result<v1::Act> act_of(const pickle::Pickle& message, const Observed& observed, 
   if (task->data.size() > limits.max_text_bytes())
     return bad(Code::too_large, "task", fmt::format("at most {} bytes", limits.max_text_bytes()),
                fmt::format("{} bytes", task->data.size()));
+  for (const std::string& name : names.absent) {
+    v1::View& view = *act.add_views();
+    view.set_name(name);
+    view.mutable_absent();
+  }
   act.set_text(std::string(task->data));
   return act;
 }

@@ -13,7 +13,7 @@ namespace vla::serve::lerobot {
 
 /// The names of LeRobot: a policy's own, `observation.images.X` and `observation.state`, unless a line gives one of
 /// them another feature. Errors: usage, also for a policy that has not one state.
-Result<Names> lerobot_names(const std::vector<std::string>& lines, const v1::Description& description);
+Result<Names> lerobot_names(Given given, const v1::Description& description);
 
 /// A robot's set-up, sent before its first observation: how its readings become a state, and which cameras it has.
 struct Setup {

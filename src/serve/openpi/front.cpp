@@ -72,7 +72,8 @@ Front::Front(net::Loop& loop, const ServerOptions& options, std::string api_key)
 
 Status Front::serve(const ServedPolicy& policy) {
   VLA_CHECK(check_one_robot(*policy.engine, "--openpi"));
-  VLA_TRY(names_, names_for(options_.preset, lines_of(options_.map, false), policy.description, "--openpi"));
+  const Given given = {options_.preset, lines_of(options_.map, false), options_.absent};
+  VLA_TRY(names_, names_for(given, policy.description, "--openpi"));
   replaced(policy.description);
   return {};
 }
