@@ -51,7 +51,7 @@ CASES = {  # what the message must contain: (change, class)
     "config.json: adapt_to_pi_aloha: expected False, found True": (config(adapt_to_pi_aloha=True), UNSUPPORTED),
     "config.json: use_cache: expected True, found False": (config(use_cache=False), UNSUPPORTED),
     "config.json: n_obs_steps: expected 1, found 2": (config(n_obs_steps=2), UNSUPPORTED),
-    "config.json: rtc_config: expected none": (config(rtc_config={"enabled": True}), UNSUPPORTED),
+    "config.json: rtc_config: expected none": (config(rtc_config={"execution_horizon": 0}), BAD),
     "resize_imgs_with_padding: expected a square, found 16 x 32": (
         config(resize_imgs_with_padding=[16, 32]),
         UNSUPPORTED,

@@ -18,6 +18,8 @@ from .section import Section
 
 EMPTY_CAMERA = "observation.images.empty_camera_"
 MAX_DIM, MAX_EMPTY = 1 << 16, 64
+RTC_CONFIG = {"execution_horizon": 10, "prefix_attention_schedule": "LINEAR", "max_guidance_weight": 10.0}  # defaults of LeRobot's class
+RTC_SCHEDULES = ("ZEROS", "ONES", "LINEAR", "EXP")
 # Keys that no number of an action chunk depends on.
 IGNORED = set(
     """
@@ -43,9 +45,38 @@ def check_keys(policy: Section, name: str, known: Set[str], fixed: Dict[str, Tup
         )
     for key, (value, hint) in fixed.items():
         policy.fixed(key, value, hint)
-    rtc = policy.get("rtc_config")
-    if rtc is not None and (not isinstance(rtc, dict) or rtc.get("enabled", True)):
-        policy.bad("rtc_config", "none, or one that is not enabled", hint="real-time chunking changes the velocity", unsupported=True)
+    if not _sound_rtc(policy.get("rtc_config")):
+        expected = "none, or execution_horizon above 0, prefix_attention_schedule {} and max_guidance_weight above 0"
+        policy.bad("rtc_config", expected.format(", ".join(RTC_SCHEDULES)))
+
+
+def _sound_rtc(rtc) -> bool:
+    """Without rows of a chunk before the reference computes the same, whether it is enabled or not."""
+    if not isinstance(rtc, dict):
+        return rtc is None
+    horizon, schedule, weight = (rtc.get(key, default) for key, default in RTC_CONFIG.items())
+    is_weight = isinstance(weight, (int, float)) and not isinstance(weight, bool) and 0 < weight < 1e9
+    return type(horizon) is int and 0 < horizon <= MAX_DIM and schedule in RTC_SCHEDULES and is_weight
+
+
+def run_keys(checkpoint: Checkpoint, views: Sequence[str]) -> List[Key]:
+    """How the checkpoint is run: what changes no number of a chunk, but what a robot does with it."""
+    config, keys = checkpoint.config, []
+    steps, rtc = config.get("n_action_steps"), config.get("rtc_config")
+    if type(steps) is int and 0 < steps <= MAX_DIM:
+        keys.append(Key("action.n_action_steps", "u32", steps))
+        told = "n_action_steps: the checkpoint executes {} of the {} rows of a chunk before it looks again"
+        checkpoint.notes.append(told.format(steps, config.get("chunk_size", "?")))
+    shapes = [(config.get("input_features", {}).get(view) or {}).get("shape") for view in views]
+    sizes = [(shape[2], shape[1]) if isinstance(shape, list) and len(shape) == 3 else (0, 0) for shape in shapes]
+    if any(sizes) and all(type(side) is int and 0 <= side <= MAX_DIM - 1 for size in sizes for side in size):
+        keys.append(Key("observation.camera_sizes", "u32[]", [side for size in sizes for side in size]))
+    if isinstance(rtc, dict) and _sound_rtc(rtc):
+        horizon, schedule, weight = (rtc.get(key, default) for key, default in RTC_CONFIG.items())
+        keys.append(Key("rtc.execution_horizon", "u32", horizon))
+        keys.append(Key("rtc.schedule", "string", schedule.lower()))
+        keys.append(Key("rtc.max_guidance", "f32", float(weight)))
+    return keys
 
 
 def no_position_rule(policy: Section, options: Options, problems: Problems) -> None:
@@ -145,13 +176,13 @@ def view_keys(checkpoint: Checkpoint, views: Sequence[str], processors: recipe.P
     if empty:
         checkpoint.notes.append("views that stay empty unless a frame is given: " + ", ".join(empty))
     aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
-    return views_of(views, aliases, [int(view in empty) for view in views])
+    return [*views_of(views, aliases, [int(view in empty) for view in views]), *run_keys(checkpoint, views)]
 
 
 def required_view_keys(checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems) -> List[Key]:
     """Of a policy whose reference needs every view."""
     aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
-    return views_of(views, aliases, [0] * len(views), len(views))
+    return [*views_of(views, aliases, [0] * len(views), len(views)), *run_keys(checkpoint, views)]
 
 
 def tokenizer_folder(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:

@@ -29,7 +29,7 @@ from ...errors import Code, Problems, refuse
 from ...features import robot_keys, view_name, views_of
 from ...files import member, read_json
 from ...images import IMAGENET
-from ...lerobot import check_keys, check_widths, no_position_rule, read_views, vector_dim
+from ...lerobot import check_keys, check_widths, no_position_rule, read_views, run_keys, vector_dim
 from ...networks import MAX_LAYERS
 from ...normalization import Normalization
 from ...options import Option, stats, variant, views
@@ -524,4 +524,4 @@ def _gripper(policy: Section, width: int) -> List[dict]:
 def _view_keys(views: List[str], n_empty: int, processors: recipe.Processors, checkpoint: Checkpoint, problems: Problems) -> List[Key]:
     """The reference takes an unmentioned camera as absent, of any name, but no more of them than `empty_cameras`."""
     aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
-    return views_of(views, aliases, [1] * len(views), max(1, len(views) - n_empty))
+    return [*views_of(views, aliases, [1] * len(views), max(1, len(views) - n_empty)), *run_keys(checkpoint, views)]
