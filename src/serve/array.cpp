@@ -6,6 +6,7 @@
 #include <fmt/ranges.h>
 
 #include <charconv>
+#include <cmath>
 
 #include "base/printable.h"
 #include "processor/image_codecs.h"
@@ -13,7 +14,7 @@
 namespace vla::serve {
 namespace {
 
-constexpr std::string_view kNumbers[] = {"b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"};
+constexpr std::string_view kNumbers[] = {"b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"};
 constexpr std::size_t kMaxCharacters = 65535;
 
 Error bad(const std::string& where, std::string expected, std::string found, std::string hint = {}) {
@@ -22,13 +23,25 @@ Error bad(const std::string& where, std::string expected, std::string found, std
 
 std::string text_of(const std::vector<std::int64_t>& shape) { return fmt::format("({})", fmt::join(shape, ", ")); }
 
+template <class T>
+T times_255(T value) {
+  return T{255} * value;
+}
+/// Rounded to the eleven bits of a half, which cuts no number from 0 to 255 to another integer than its own arithmetic.
+float times_255(Half value) {
+  int exponent = 0;
+  const float product = 255 * static_cast<float>(value);
+  std::frexp(product, &exponent);
+  return std::ldexp(std::nearbyint(std::ldexp(product, 11 - exponent)), exponent - 11);
+}
+
 /// 255 x cut to an integer.
 template <class T>
 Status cut_to_bytes(const Elements<T>& elements, const std::string& where, std::vector<std::uint8_t>& out) {
   for (std::size_t i = 0; i < out.size(); ++i) {
     const T value = elements[i];
-    if (!(value >= 0 && value <= 1)) return bad(where, "floats in [0, 1]", fmt::format("{}", value));
-    out[i] = static_cast<std::uint8_t>(T{255} * value);
+    if (!(value >= 0 && value <= 1)) return bad(where, "floats in [0, 1]", fmt::format("{}", +value));
+    out[i] = static_cast<std::uint8_t>(times_255(value));
   }
   return {};
 }
@@ -37,10 +50,10 @@ Status cut_to_bytes(const Elements<T>& elements, const std::string& where, std::
 Result<std::vector<std::uint8_t>> pixels_of(const Array& array, const std::string& where) {
   std::vector<std::uint8_t> values(array.count());
   const Status valid = array.visit([&]<class T>(const Elements<T>& elements) -> Status {
-    if constexpr (std::is_floating_point_v<T>) return cut_to_bytes(elements, where, values);
+    if constexpr (std::is_floating_point_v<T> || std::is_same_v<T, Half>) return cut_to_bytes(elements, where, values);
     if (array.type().kind() != 'u' || array.type().size() != 1)
-      return bad(where, "pixels of dtype uint8, or float32 or float64 in [0, 1]", "dtype " + array.type().name(),
-                 "convert them: astype(numpy.uint8)");
+      return bad(where, "pixels of dtype uint8, or float16, float32 or float64 in [0, 1]",
+                 "dtype " + array.type().name(), "convert them: astype(numpy.uint8)");
     std::copy(elements.data.begin(), elements.data.end(), values.begin());
     return {};
   });
@@ -72,8 +85,8 @@ Result<ElementType> ElementType::read(std::string_view text, const std::string& 
   const bool has_order =
       text.starts_with('<') || text.starts_with('>') || (text.starts_with('|') && size == 1 && !is_text);
   if (!has_order || (!is_number && !is_text))
-    return bad(where, "a dtype of booleans, integers, float32 or float64", "dtype " + printable(text.substr(0, 20)),
-               "convert the array: astype(numpy.float32)");
+    return bad(where, "a dtype of booleans, integers, float16, float32 or float64",
+               "dtype " + printable(text.substr(0, 20)), "convert the array: astype(numpy.float32)");
   type.order_ = text[0];
   type.kind_ = letters[0];
   type.size_ = is_text ? 4 * size : size;

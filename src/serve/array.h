@@ -3,6 +3,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <string>
@@ -16,7 +17,7 @@ namespace vla::serve {
 /// The type of an array's elements: one of those that `read` lists.
 class ElementType {
  public:
-  /// Reads NumPy's type string: a byte order and b1, i1, i2, i4, i8, u1, u2, u4, u8, f4, f8 or, for text, U with a
+  /// Reads NumPy's type string: a byte order and b1, i1, i2, i4, i8, u1, u2, u4, u8, f2, f4, f8 or, for text, U with a
   /// number of characters. The order is `<` or `>`; elements of one byte may have `|`. Errors: bad_observation.
   static Result<ElementType> read(std::string_view text, const std::string& where);
 
@@ -60,6 +61,18 @@ class Array {
   std::string_view data_;
 };
 
+/// A number of NumPy's float16, which is exact as a float.
+struct Half {
+  std::uint16_t bits;
+  operator float() const {  // NOLINT: as the built-in types convert
+    const int exponent = bits >> 10 & 0x1F, fraction = bits & 0x3FF;
+    const float size = exponent == 31  ? (fraction != 0 ? NAN : INFINITY)
+                       : exponent == 0 ? std::ldexp(static_cast<float>(fraction), -24)
+                                       : std::ldexp(static_cast<float>(fraction + 0x400), exponent - 25);
+    return (bits & 0x8000) != 0 ? -size : size;
+  }
+};
+
 /// The elements of an array, of a known type.
 template <class T>
 struct Elements {
@@ -82,8 +95,8 @@ struct Elements {
 Result<std::vector<float>> row_of(const Array& array, const std::string& where);
 
 /// A camera frame of (height, width, 3) or (3, height, width), dimensions of one before them being dropped: uint8, or
-/// float32 or float64 in [0, 1], which become uint8 as the references make them, by 255 x in the array's own arithmetic
-/// and a cut. `is_bgr`: blue comes first. Errors: bad_observation, and `limits.over` for too many pixels.
+/// float16, float32 or float64 in [0, 1], which become uint8 as the references make them, by 255 x in the array's own
+/// arithmetic and a cut. `is_bgr`: blue comes first. Errors: bad_observation, and `limits.over` for too many pixels.
 Result<Frame> frame_of(const Array& array, const std::string& where, const ImageLimits& limits, bool is_bgr);
 
 /// The text of an array of one. Errors: bad_observation.
@@ -96,6 +109,7 @@ auto Array::visit(Visit visit) const {
     case 'b':
       return visit(Elements<bool>{data_, swap});
     case 'f':
+      if (type_.size() == 2) return visit(Elements<Half>{data_, swap});
       if (type_.size() == 4) return visit(Elements<float>{data_, swap});
       return visit(Elements<double>{data_, swap});
     case 'i':

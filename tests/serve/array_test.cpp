@@ -8,6 +8,7 @@
 #include <doctest/doctest.h>
 
 #include <bit>
+#include <cmath>
 #include <functional>
 #include <map>
 
@@ -33,6 +34,15 @@ std::string encoded(double value, bool is_big) {
   return bytes;
 }
 
+/// Of the numbers of these tests, which are whole and small.
+std::string encoded_half(double value, bool is_big) {
+  int exponent = 0;
+  const double fraction = std::frexp(value, &exponent);
+  const auto bits =
+      static_cast<std::uint16_t>(value == 0 ? 0 : (exponent + 14) << 10 | static_cast<int>(fraction * 2048) % 1024);
+  return encoded<std::uint16_t>(bits, is_big);
+}
+
 /// A number as bytes of a type by its letters; empty where that type has no numbers or is not taken.
 std::string encoded(const std::string& letters, double value, bool is_big) {
   using Encode = std::string (*)(double, bool);
@@ -40,7 +50,7 @@ std::string encoded(const std::string& letters, double value, bool is_big) {
       {"b1", encoded<std::uint8_t>},  {"i1", encoded<std::int8_t>},   {"i2", encoded<std::int16_t>},
       {"i4", encoded<std::int32_t>},  {"i8", encoded<std::int64_t>},  {"u1", encoded<std::uint8_t>},
       {"u2", encoded<std::uint16_t>}, {"u4", encoded<std::uint32_t>}, {"u8", encoded<std::uint64_t>},
-      {"f4", encoded<float>},         {"f8", encoded<double>}};
+      {"f2", encoded_half},           {"f4", encoded<float>},         {"f8", encoded<double>}};
   const auto found = types.find(letters);
   return found == types.end() ? std::string() : found->second(value, is_big);
 }
@@ -136,7 +146,7 @@ TEST_CASE("every type of elements is read rightly or refused with one that works
       check_words(refused.error(), letters);
     }
   });
-  CHECK(n_taken == 3 * 3 + 8 * 2);
+  CHECK(n_taken == 3 * 3 + 9 * 2);
 }
 
 TEST_CASE("large numbers of every width keep sign and value in both byte orders") {
@@ -155,6 +165,10 @@ TEST_CASE("large numbers of every width keep sign and value in both byte orders"
     CHECK(number("u2", std::uint16_t{65535}) == 65535);
     CHECK(number("u4", std::uint32_t{0xFFFFFFFF}) == 4294967295.0f);
     CHECK(number("u8", UINT64_MAX) == 18446744073709551615.0f);
+    CHECK(number("f2", std::uint16_t{0xBE00}) == -1.5f);
+    CHECK(number("f2", std::uint16_t{0x7BFF}) == 65504.0f);
+    CHECK(number("f2", std::uint16_t{0x0001}) == 0x1p-24f);
+    CHECK(number("f2", std::uint16_t{0xFC00}) == -INFINITY);
     CHECK(number("f4", -1.5f) == -1.5f);
     CHECK(number("f8", -1.25) == -1.25f);
   }
@@ -184,7 +198,7 @@ TEST_CASE("frames of every type become pixels in each front end, or are refused 
     std::string data;
     for (const double value : {0, 1, 1, 0, 1, 0}) data += encoded(letters, value, order == '>');
     if (data.empty()) data.resize(6 * static_cast<std::size_t>(std::stoi(letters.substr(1)) % 64), '?');
-    const bool is_pixel = letters == "u1" || letters == "f4" || letters == "f8";
+    const bool is_pixel = letters == "u1" || letters == "f2" || letters == "f4" || letters == "f8";
     const bool is_taken = is_pixel && is_order(order, letters);
     const std::vector<std::int64_t> shape = {1, 2, 3};
     check_frame(from_openpi(letters, order, shape, data), letters, is_taken);
@@ -207,9 +221,17 @@ TEST_CASE("frames of every type become pixels in each front end, or are refused 
   });
 }
 
-TEST_CASE("a frame in half precision whose bytes fit is refused by name, and nothing beyond them is read") {
-  const auto refused = from_lerobot({"f2", "<", {100, 41, 3}, std::string(2 * 100 * 41 * 3, '\0')});
-  REQUIRE(!refused);
-  CHECK(refused.error().found == "dtype <f2");
-  CHECK(refused.error().hint.find("float32") != std::string::npos);
+TEST_CASE("a frame in half precision has the bytes of its own arithmetic") {
+  // NumPy 2.2: (255 * numpy.float16(x)).astype(numpy.uint8) of these bits.
+  const std::pair<std::uint16_t, int> cases[] = {{0x3800, 127}, {0x3BFF, 254}, {0x3BF8, 254}, {0x1C04, 1},
+                                                 {0x1C02, 0},   {0x3A46, 200}, {0x3001, 31},  {0x0001, 0}};
+  for (const auto& [bits, byte] : cases) {
+    CAPTURE(bits);
+    std::string data;
+    for (int i = 0; i < 3; ++i) data += encoded<std::uint16_t>(bits, false);
+    const auto frame = from_lerobot({"f2", "<", {1, 1, 3}, data});
+    REQUIRE(frame);
+    CHECK(pixels(*frame) == std::vector<int>(3, byte));
+  }
+  CHECK(!from_lerobot({"f2", "<", {100, 41, 3}, std::string(2 * 100 * 41 * 3, '\xFF')}));
 }

@@ -344,7 +344,8 @@ class Reader {
     if (array.type().is_text()) return bad("a number", "text of NumPy");
     return array.visit([&]<class T>(const serve::Elements<T>& elements) -> Status {
       const T value = elements[0];
-      if constexpr (std::is_floating_point_v<T>) return push({.type = Type::real, .real = value});
+      if constexpr (std::is_floating_point_v<T> || std::is_same_v<T, serve::Half>)
+        return push({.type = Type::real, .real = static_cast<double>(value)});
       if constexpr (std::is_same_v<T, std::uint64_t>)
         if (value > INT64_MAX) return bad("integers of 64 bits with a sign", std::to_string(value));
       return push_integer(std::is_same_v<T, bool> ? Type::boolean : Type::integer, static_cast<std::int64_t>(value));
