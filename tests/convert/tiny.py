@@ -122,7 +122,7 @@ def tokenizer():
     merges = [["t", "o"], ["\u0120", "to"], ["\u0120to", "p"], ["\u0120", "\u0120"], ["i", "n"]]
     vocab = {text: i for i, text in enumerate([SPECIAL[0]] + symbols + [a + b for a, b in merges])}
     flags = {"single_word": False, "lstrip": False, "rstrip": False, "normalized": False, "special": True}
-    added = [{"id": 0, "content": SPECIAL[0], **flags}, {"id": len(vocab) + 3, "content": SPECIAL[1], **flags}]
+    added = [{"id": 0, "content": SPECIAL[0], **flags}, {"id": len(vocab), "content": SPECIAL[1], **flags}]
     return {
         "version": "1.0",
         "truncation": None,

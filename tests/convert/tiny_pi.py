@@ -33,13 +33,14 @@ SPECIAL = ["<pad>", "<eos>", "<bos>", "<unk>", "<mask>"]
 BLANK = "\u2581"
 
 
-def tokenizer(n_vocab_free=3):
+def tokenizer(n_unused=3):
     """The shape of PaliGemma's: bytes, a few pieces, <image> right behind the last row of the embedding."""
     pieces = [*SPECIAL, *("<0x{:02X}>".format(b) for b in range(256)), *"pickuthe", BLANK, "\n", "\n\n"]
     merges = [["p", "i"], ["t", "h"], ["th", "e"], [BLANK, "the"], [BLANK, BLANK]]
     pieces += [a + b for a, b in merges]
+    pieces += ["<unused{}>".format(i) for i in range(n_unused)]
     vocab = {text: i for i, text in enumerate(dict.fromkeys(pieces))}
-    n_vocab = len(vocab) + n_vocab_free
+    n_vocab = len(vocab)
     flags = {"single_word": False, "lstrip": False, "rstrip": False, "normalized": False, "special": True}
     added = [{"id": vocab[text], "content": text, **flags} for text in SPECIAL]
     added.append({"id": vocab["\n\n"], "content": "\n\n", **flags, "special": False})

@@ -3,14 +3,18 @@
 """The tokenizer's keys: enough to rebuild it exactly, and nothing that the runtime does not implement."""
 
 import json
+from pathlib import Path
 
 import pytest
 from tokenizers import AddedToken, Regex, Tokenizer, models, normalizers, pre_tokenizers
 
 from tiny import N_VOCAB, SPECIAL, Tiny, byte_alphabet, write_json
-from vla_cpp.convert import Code
+from vla_cpp.convert import Code, ConvertError
+from vla_cpp.convert.errors import Problems
+from vla_cpp.convert.tokenizer import read_tokenizer
 from vla_cpp.convert.tokenizer_byte_level import byte_symbols
 
+TOKENIZERS = Path(__file__).resolve().parents[1] / "golden/tokenizers"
 STRINGS = [
     "pick up the top\n",
     "to top 12 top",
@@ -64,17 +68,7 @@ def ids(keys, text):
 
 
 def reference(tiny, text):
-    return Tokenizer.from_str(json.dumps(compacted(tiny.tokenizer))).encode(text, add_special_tokens=False)
-
-
-def compacted(spec):
-    """The library refuses added tokens above a gap in the ids, as written by trainers it accepts them: fill the gap."""
-    spec = json.loads(json.dumps(spec))
-    first = len(spec["model"]["vocab"])
-    last = spec["added_tokens"][-1]["id"]
-    for i in range(first, last):
-        spec["model"]["vocab"]["hole {}".format(i)] = i
-    return spec
+    return Tokenizer.from_str(json.dumps(tiny.tokenizer)).encode(text, add_special_tokens=False)
 
 
 @pytest.mark.parametrize(
@@ -113,9 +107,11 @@ def test_merges_spelled_as_strings_and_as_pairs_give_the_same_bundle(converter, 
 
 
 def test_holes_in_the_vocabulary_get_texts_that_no_text_can_become(converter, tiny):
+    vocab = tiny.tokenizer["model"]["vocab"]
+    vocab["hole"] = len(vocab) + 4
     tokens = converter.bundle(tiny).keys["tokenizer.tokens"]
-    last = tiny.tokenizer["added_tokens"][1]["id"]
-    assert len(tokens) == last + 1 and tokens[last] == SPECIAL[1]
+    last = vocab["hole"]
+    assert len(tokens) == last + 1 and tokens[last] == "hole"
     assert tokens[last - 1] == "<no token {}>".format(last - 1)
     assert len(set(tokens)) == len(tokens) and " " not in "".join(byte_symbols())
 
@@ -220,11 +216,13 @@ CASES = {
         BAD,
     ),
     "ids: expected ids below vocab_size 300, found 1 above, the first is 300 ('<late>')": (
-        lambda t: t.tokenizer["added_tokens"].append({"id": N_VOCAB, "content": "<late>"}),
+        lambda t: t.tokenizer["added_tokens"].extend(
+            {"id": i, "content": "<late>" if i == N_VOCAB else "<{}>".format(i)}
+            for i in range(t.tokenizer["added_tokens"][-1]["id"] + 1, N_VOCAB + 1)
+        ),
         BAD,
     ),
     "id 9: expected one token": (lambda t: t.tokenizer["model"]["vocab"].update({"twice": 9}), BAD),
-    "id 270: expected one token": (lambda t: t.tokenizer["added_tokens"].append({"id": 270, "content": "Q"}), BAD),
     "model.merges[1]: expected two tokens whose union is a token": (
         lambda t: t.tokenizer["model"]["merges"].insert(1, ["t", "q"]),
         BAD,
@@ -232,6 +230,29 @@ CASES = {
     "model.merges[0]: expected two tokens": (lambda t: t.tokenizer["model"].update(merges=["t o o"]), BAD),
     "model.merges: expected a list": (lambda t: t.tokenizer["model"].update(merges=None), BAD),
 }
+
+
+def token(number, content):
+    return {"id": number, "content": content, **dict.fromkeys(("single_word", "lstrip", "rstrip", "normalized"), False), "special": True}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda added: added[-1].update(id=added[-1]["id"] + 5),  # a hole
+        lambda added: added.append(token(added[-1]["id"], "<twice>")),  # one id for two
+        lambda added: added.append(token(270, "Q")),  # another id than the model's
+        lambda added: added.extend([token(290, "<b>"), token(280, "<a>")]),
+        lambda added: added.append(token(299, added[-1]["content"])),  # one token with two ids
+    ],
+)
+def test_added_tokens_have_the_ids_that_the_library_gives_them(converter, tiny, change):
+    change(tiny.tokenizer["added_tokens"])
+    bundle = converter.bundle(tiny)
+    library = Tokenizer.from_str(json.dumps(tiny.tokenizer))
+    added = json.loads(bundle.keys["tokenizer.added"])
+    assert {t["content"]: t["id"] for t in added} == {t.content: i for i, t in library.get_added_tokens_decoder().items()}
+    assert any("other ids than the file states" in note for note in converter.summary.notes)
 
 
 @pytest.mark.parametrize("message", CASES)
@@ -261,3 +282,65 @@ def test_a_tokenizer_without_tokenizer_json_is_told_how_to_get_one(converter):
     write_json(str(converter.folder / "vlm" / "vocab.json"), {})
     error = converter.refusal()
     assert "save it again" in error.message() and error.code == Code.IO
+
+
+# --- what transformers builds anew, whatever tokenizer.json says --------------------------------------------------------------------------
+
+
+def read(tmp_path, name, change, model_type=None):
+    """The keys of a tokenizer of tests/golden with changed files, and the notes."""
+    files = {file: json.loads((TOKENIZERS / name / file).read_text()) for file in ("tokenizer.json", "tokenizer_config.json")}
+    change(*files.values())
+    for file, value in files.items():
+        write_json(tmp_path / file, value)
+    if model_type:
+        write_json(tmp_path / "config.json", {"model_type": model_type})
+    problems, notes = Problems(str(tmp_path)), []
+    plan = read_tokenizer(str(tmp_path), 1024, problems, notes)
+    problems.raise_any()
+    return {key.name: key.value for key in plan.keys}, notes
+
+
+def without(spec, config):
+    del spec["post_processor"]
+
+
+def unnamed(spec, config):
+    del config["tokenizer_class"]
+
+
+@pytest.mark.parametrize("name, front, behind", [("bert", [2], [3]), ("bart", [0], [2])])
+def test_a_class_that_builds_the_template_does_so_where_the_file_has_none(tmp_path, name, front, behind):
+    keys, notes = read(tmp_path, name, without)
+    assert keys["tokenizer.prefix_ids"] == front and keys["tokenizer.suffix_ids"] == behind
+    assert any("no post_processor" in note for note in notes)
+
+
+def test_a_template_that_contradicts_the_class_is_refused(tmp_path):
+    def ends(spec, config):
+        spec["post_processor"]["single"] = spec["post_processor"]["single"][1:]
+
+    with pytest.raises(ConvertError, match=r"post_processor: expected \[CLS\] and \[SEP\] of tokenizer_config.json"):
+        read(tmp_path, "bert", ends)
+
+
+def test_a_models_config_in_the_folder_names_the_class(tmp_path):
+    def spaced(spec, config):
+        unnamed(spec, config)
+        spec["pre_tokenizer"]["add_prefix_space"] = True
+
+    assert json.loads(read(tmp_path, "bart", spaced)[0]["tokenizer.pre"])[0]["add_prefix_space"] is True
+    assert json.loads(read(tmp_path, "bart", spaced, "bart")[0]["tokenizer.pre"])[0]["add_prefix_space"] is False
+    assert read(tmp_path, "bert", lambda *files: (unnamed(*files), without(*files)), "bert")[0]["tokenizer.prefix_ids"] == [2]
+
+
+def test_a_class_of_another_model_than_the_folders_leaves_the_file_as_it_is(tmp_path):
+    def spaced(spec, config):
+        spec["pre_tokenizer"]["add_prefix_space"] = True
+
+    assert json.loads(read(tmp_path, "bart", spaced, "bert")[0]["tokenizer.pre"])[0]["add_prefix_space"] is True
+
+
+def test_a_class_that_takes_its_tokens_from_the_config_needs_all_of_them_there(tmp_path):
+    with pytest.raises(ConvertError, match="added_tokens_decoder: expected all added tokens of tokenizer.json, since Qwen2Tokenizer"):
+        read(tmp_path, "evo1", lambda spec, config: config["added_tokens_decoder"].pop("318"))

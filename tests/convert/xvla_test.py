@@ -188,7 +188,7 @@ def test_a_float32_checkpoint_that_the_reference_rounds_is_rounded(planned):
         ("policy_preprocessor.json", "steps/2/config/padding_side", "left", "padding_side: expected 'right'"),
         ("policy_preprocessor.json", "steps/3", {"registry_name": "xvla_image_scale", "config": {}}, "steps[3]: expected one of"),
         ("policy_postprocessor.json", "steps/1", {"registry_name": "xvla_rotation_6d_to_axis_angle"}, "steps[1]: expected one of"),
-        ("tokenizer/tokenizer.json", "post_processor/sep", ["<pad>", 1], "post_processor: expected cls_token and sep_token"),
+        ("tokenizer/tokenizer.json", "post_processor/sep", ["<pad>", 1], "post_processor: expected <s> and </s> of tokenizer_config.json"),
         ("tokenizer/tokenizer.json", "post_processor/type", "BertProcessing", "post_processor: expected a template of special tokens around"),
         ("tokenizer/tokenizer_config.json", "pad_token", "<none>", "pad_token: expected a token"),
     ],

@@ -17,6 +17,7 @@ from .errors import Code, Problems, refuse
 from .files import member, read_json
 from .tokenizer_parts import (
     CONFIG_FILE,
+    GENERIC,
     JSON_FILE,
     Tokenizer,
     add_special,
@@ -27,6 +28,17 @@ from .tokenizer_parts import (
     vocabulary,
 )
 
+MODEL_FILE = "config.json"
+# The tokenizer's class by model_type, of the models whose tokenizers are used here (transformers 5.5).
+CLASSES = {
+    "bart": "RobertaTokenizer",
+    "bert": "BertTokenizer",
+    "florence2": "BartTokenizer",
+    "gpt2": "GPT2Tokenizer",
+    **dict.fromkeys(("gemma", "gemma2"), "GemmaTokenizer"),
+    **dict.fromkeys(("internvl_chat", "llava", "openvla"), GENERIC[0]),
+    **dict.fromkeys(("internvl", "qwen2", "qwen2_5_vl", "qwen2_vl", "qwen3", "qwen3_vl"), "Qwen2Tokenizer"),
+}
 NO_ROW = -1  # the id of an added token that the embedding has no row for
 
 
@@ -45,8 +57,8 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
     spec, config = _read_files(folder, problems, notes)
     model = member(spec, "model", dict, JSON_FILE)
     kind = _kind(model)
-    config = kind.with_defaults(config)
-    added = added_tokens(spec, problems)
+    config = kind.with_defaults(_with_class(folder, config))
+    added = added_tokens(spec, model, config, problems, notes)
     check_config_tokens(config, added, problems)
     add_special(added, model, more, problems)
     tokenizer = Tokenizer(spec, config, model, added, n_vocab)
@@ -89,6 +101,19 @@ def _read_files(folder: str, problems: Problems, notes: List[str]) -> Tuple[dict
         )
     notes.append("tokenizer: from {}, as transformers makes {} of it".format(os.path.basename(pieces), JSON_FILE))
     return tokenizer_sentencepiece.read_spec(pieces, problems), config or tokenizer_sentencepiece.CONFIG
+
+
+def _with_class(folder: str, config: dict) -> dict:
+    """The config with the class that AutoTokenizer builds: where the folder has the config of a model, the one of its model_type. A class
+    of another name than that yields to the file as it is (transformers auto/tokenization_auto.py, from_pretrained)."""
+    path = os.path.join(folder, MODEL_FILE)
+    stated = read_json(path) if os.path.isfile(path) else {}
+    own = CLASSES.get(str(stated.get("model_type")))
+    named = config.get("tokenizer_class") or (None if own else stated.get("tokenizer_class"))
+    if own is None or config.get("auto_map") is not None:
+        return dict(config, tokenizer_class=named)
+    same = named is None or str(named).replace("Fast", "") == own
+    return dict(config, tokenizer_class=own if same else GENERIC[0])
 
 
 def _with_rows(added: List[dict], n_vocab: int) -> List[dict]:

@@ -22,7 +22,7 @@ from .tokenizer_parts import (
     check_ids,
     check_model,
     check_symbols,
-    content_of,
+    class_around,
     one_or_sequence,
     prefix_ids,
     stated_around,
@@ -83,7 +83,7 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     check_symbols(tokenizer.model, byte_symbols(), problems)
     _check_surroundings(tokenizer, problems)
     spec, config = tokenizer.spec, tokenizer.config
-    front, behind = _around(tokenizer, problems)
+    front, behind = _around(tokenizer, problems, notes)
     splitting = _Splitting(_pre_tokenizer(spec.get("pre_tokenizer"), problems), _normalization(spec.get("normalizer"), problems))
     own = _of_class(config)
     if own is not None and own != splitting:
@@ -103,19 +103,14 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     ]
 
 
-def _around(tokenizer: Tokenizer, problems: Problems) -> Tuple[List[int], List[int]]:
-    """BART's class makes the template itself, of two tokens of the config: both must say the same."""
+def _around(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> Tuple[List[int], List[int]]:
+    """BART's class makes the template itself."""
     config, post = tokenizer.config, tokenizer.spec.get("post_processor")
     is_bart = isinstance(post, dict) and post.get("type") == "RobertaProcessing" and config.get("tokenizer_class") not in GPT2 + QWEN2
     if not is_bart and config.get("tokenizer_class") not in BART:
         return prefix_ids(tokenizer, problems), []
     around = stated_around(tokenizer, problems, "a template of special tokens around the text", may_follow=True)
-    if config.get("tokenizer_class") in BART:
-        ids = {token["content"]: token["id"] for token in tokenizer.added}
-        own = tuple([ids.get(content_of(config[name]), -1)] for name in ("cls_token", "sep_token"))
-        if own != around:
-            problems.add(JSON_FILE + ": post_processor", "cls_token and sep_token of {}: {}".format(CONFIG_FILE, own), str(around))
-    return around
+    return class_around(tokenizer, around, problems, notes) if config.get("tokenizer_class") in BART else around
 
 
 def _of_class(config: dict) -> Optional[_Splitting]:

@@ -72,15 +72,35 @@ def to_json(value) -> str:
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
 
 
-def added_tokens(spec: dict, problems: Problems) -> List[dict]:
-    added = []
-    for token in member(spec, "added_tokens", list, JSON_FILE):
+def added_tokens(spec: dict, model: dict, config: dict, problems: Problems, notes: List[str]) -> List[dict]:
+    """With the ids that the library gives them, whatever the file says: a token of the model's keeps its own, another gets the next one
+    (tokenizers added_vocabulary.rs, add_tokens). A class that builds its own tokenizer adds them in the order of the file's ids."""
+    vocab, added, renumbered = member(model, "vocab", dict, JSON_FILE), [], []
+    listed = member(spec, "added_tokens", list, JSON_FILE)
+    if config.get("tokenizer_class") not in (None, *GENERIC):
+        listed = sorted(listed, key=lambda token: token["id"] if isinstance(token, dict) and type(token.get("id")) is int else 0)
+    for token in listed:
         content, number = (token.get("content"), token.get("id")) if isinstance(token, dict) else (None, None)
         if not isinstance(content, str) or not content or type(number) is not int or number < 0:
             problems.add(JSON_FILE + ": added_tokens", "tokens with id and content", to_json(token)[:80])
             continue
-        added.append({"id": number, "content": content, **{flag: bool(token.get(flag, False)) for flag in FLAGS}})
+        there = next((other for other in added if other["content"] == content), None)
+        own = there["id"] if there else vocab.get(content, next_id(added, vocab))
+        if own != number:
+            renumbered.append("{} is {}".format(content, own))
+        flags = {flag: bool(token.get(flag, False)) for flag in FLAGS}
+        if there:
+            there.update(flags)
+        else:
+            added.append({"id": own, "content": content, **flags})
+    if renumbered:
+        told = ", ".join(renumbered[:3]) + (", ..." if len(renumbered) > 3 else "")
+        notes.append("{}: added tokens have other ids than the file states, as transformers numbers them: {}".format(JSON_FILE, told))
     return added
+
+
+def next_id(added: List[dict], vocab: dict) -> int:
+    return max([len(vocab), *(token["id"] + 1 for token in added)])
 
 
 def add_special(added: List[dict], model: dict, texts: Sequence[str], problems: Problems) -> None:
@@ -91,8 +111,7 @@ def add_special(added: List[dict], model: dict, texts: Sequence[str], problems: 
     for text in (text for text in texts if text not in there):
         if text in vocab:
             problems.unsupported(JSON_FILE + ": model.vocab", "no token " + text + " of the model's", "one", "text would split around it")
-        number = max([len(vocab), *(token["id"] + 1 for token in added)])
-        added.append({"id": number, "content": text, **dict.fromkeys(FLAGS, False), "special": True})
+        added.append({"id": next_id(added, vocab), "content": text, **dict.fromkeys(FLAGS, False), "special": True})
         there.add(text)
 
 
@@ -116,7 +135,17 @@ def check_config_tokens(config: dict, added: List[dict], problems: Problems) -> 
                     repr(token),
                     "load the tokenizer with transformers and save it again",
                 )
-    for number, token in member(config, "added_tokens_decoder", dict, CONFIG_FILE).items():
+    decoder = member(config, "added_tokens_decoder", dict, CONFIG_FILE)
+    listed = {content_of(token) for token in decoder.values()}
+    missing = [token["content"] for token in added if token["content"] not in listed]
+    if decoder and missing and config.get("tokenizer_class") not in (None, *GENERIC):
+        problems.add(
+            CONFIG_FILE + ": added_tokens_decoder",
+            "all added tokens of {}, since {} takes no others".format(JSON_FILE, config["tokenizer_class"]),
+            "{} missing, the first is {!r}".format(len(missing), missing[0]),
+            "load the tokenizer with transformers and save it again",
+        )
+    for number, token in decoder.items():
         content = content_of(token)
         own = by_content.get(content) if isinstance(content, str) else None
         stated = {flag: bool(token.get(flag, False)) for flag in FLAGS} if isinstance(token, dict) else {}
@@ -213,6 +242,23 @@ def stated_around(tokenizer: Tokenizer, problems: Problems, wanted: str, may_fol
             "load the tokenizer with transformers and save it again",
         )
     return front, behind
+
+
+def class_around(tokenizer: Tokenizer, stated: Tuple[List[int], List[int]], problems: Problems, notes: List[str]) -> Tuple[List[int], List[int]]:
+    """The ids around a text by a class that makes the template itself, of two tokens of the config. `stated`: what the file's template has,
+    which must be the same."""
+    ids = {**member(tokenizer.model, "vocab", dict, JSON_FILE), **{token["content"]: token["id"] for token in tokenizer.added}}
+    names = [content_of(tokenizer.config.get(name)) for name in ("cls_token", "sep_token")]
+    own = tuple([ids.get(name, -1)] for name in names if isinstance(name, str))
+    if len(own) != 2 or [-1] in own:
+        problems.add(CONFIG_FILE + ": cls_token, sep_token", "two tokens of " + JSON_FILE, repr(names))
+        return stated
+    if tokenizer.spec.get("post_processor") is None:
+        told = "{}: no post_processor; {} builds one of {} and {}, and so does the bundle"
+        notes.append(told.format(JSON_FILE, tokenizer.config["tokenizer_class"], *names))
+    elif own != stated:
+        problems.add(JSON_FILE + ": post_processor", "{} and {} of {}: {}".format(*names, CONFIG_FILE, own), str(stated))
+    return own
 
 
 def around_ids(tokenizer: Tokenizer, problems: Problems, wanted: str, may_follow: bool) -> Tuple[List[int], List[int]]:

@@ -13,7 +13,7 @@ from typing import List
 from .bundle import Key
 from .errors import Problems
 from .files import member
-from .tokenizer_parts import CONFIG_FILE, GENERIC, JSON_FILE, Tokenizer, around_ids, check_class, check_model, to_json
+from .tokenizer_parts import CONFIG_FILE, GENERIC, JSON_FILE, Tokenizer, around_ids, check_class, check_model, class_around, to_json
 
 KIND = "wordpiece"
 BERT = ("BertTokenizer", "BertTokenizerFast")
@@ -51,6 +51,8 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
             problems.unsupported("{}: {}".format(CONFIG_FILE, key), repr(values[0]), repr(tokenizer.config[key]))
     _check_words(tokenizer, problems)
     front, behind = around_ids(tokenizer, problems, "a template of special tokens around the text", may_follow=True)
+    if tokenizer.config.get("tokenizer_class") in BERT:
+        front, behind = class_around(tokenizer, (front, behind), problems, notes)
     return [
         Key("tokenizer.normalization", "string", "bert_uncased"),
         Key("tokenizer.prefix_ids", "u32[]", front),
