@@ -260,8 +260,7 @@ def test_added_tokens_that_would_move_the_views_are_refused(converter, change, m
 @pytest.mark.parametrize(
     "config, message",
     [
-        ({"type": "groot"}, "type: expected one of"),
-        ({"type": "groot"}, "a fine-tune of GR00T as LeRobot saves it is not read yet"),
+        ({"type": "groot"}, "expected LeRobot's pipelines, found none"),
         ({"model_type": "Gr00tN1d8"}, "Gr00tN1d7, found Gr00tN1d8"),
     ],
 )

@@ -23,6 +23,7 @@ from .options import Option
 from .safetensors_file import Entry, read_safetensors
 
 LEROBOT, OPENPI = "lerobot", "openpi"  # layouts; that of an architecture's authors is called as the architecture
+GROOT = "groot"  # LeRobot's type
 WEIGHTS = "model.safetensors"
 INDEX = WEIGHTS + ".index.json"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -52,8 +53,9 @@ class Checkpoint:
     notes: List[str] = field(default_factory=list)
     robot: str = ""  # whose statistics to use, where there are those of several
     backbone: str = ""  # the repository and commit that --backbone fetched
-    base: str = ""  # the folder of the policy that an adapter was trained on
+    base: str = ""  # the folder of the policy that this one, or an adapter, was trained from
     adapter: Optional[Adapter] = None
+    documents: Dict[str, dict] = field(default_factory=dict)  # by name, what stands in the place of JSON files
     degraded: List[str] = field(default_factory=list)  # features that pass unnormalized because --identity-stats allows it
 
     def path(self, name: str) -> str:
@@ -137,7 +139,8 @@ def open_checkpoint(source: str, authors: Mapping[str, Layout], base: str = "") 
     --base. Errors: usage, io, bad_bundle."""
     name, folder, revision = _opened(source)
     check_is_policy(folder)
-    below = _base_of(folder, base)  # where the weights are
+    sizes = _opened(base) if base and states_no_sizes(folder) else None
+    below = None if sizes else _base_of(folder, base)  # where the weights are
     # openpi's training writes no config.json, its converter from JAX one without a type.
     has_assets = os.path.isdir(os.path.join(folder, "assets"))
     own = folder if os.path.exists(os.path.join(folder, "config.json")) or not below else below.folder
@@ -159,8 +162,16 @@ def open_checkpoint(source: str, authors: Mapping[str, Layout], base: str = "") 
     if config.get("use_peft") and adapter is None:
         notes.append("use_peft is true, but the weights are complete without an adapter: read as merged")
     processors = _read_processors(folder) or (_read_processors(below.folder) if below and own == below.folder else None)
-    others = below.folder if below else ""
+    if sizes:
+        name = "{} on {}".format(name, sizes.name + ("@" + sizes.revision if sizes.revision else ""))
+    others = below.folder if below else sizes.folder if sizes else ""
     return Checkpoint(name, folder, revision, config, weights, aliases, old, processors, layout, notes, base=others, adapter=adapter)
+
+
+def states_no_sizes(folder: str) -> bool:
+    """Whether it is a policy whose config leaves the sizes of its network to that of its base: LeRobot's GR00T."""
+    path = os.path.join(folder, "config.json")
+    return os.path.exists(path) and read_json(path).get("type") == GROOT
 
 
 class Opened(NamedTuple):

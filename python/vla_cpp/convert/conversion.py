@@ -19,7 +19,7 @@ from .adapters import merge, stored_dtype
 from .archs import MATRIX, SCALE, TABLE, TERNARY, Options, Plan, Weight
 from .batch_norm import folded, shapes
 from .bundle import BUNDLE_VERSION, BundleWriter, Key, TensorInfo
-from .checkpoint import LEROBOT, Checkpoint, given_backbone, open_checkpoint
+from .checkpoint import GROOT, LEROBOT, Checkpoint, given_backbone, open_checkpoint
 from .dtypes import BUNDLE_NAME, WEIGHTS, convert, from_f32, to_f32
 from .embodiments import plan_robots
 from .errors import Code, Problems, refuse
@@ -58,7 +58,9 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
     checkpoint = open_checkpoint(source, archs.authors(), options.base)
     options = options.replaced(backbone=given_backbone(checkpoint, options.backbone))
     problems = Problems(checkpoint.name)
-    if checkpoint.layout == LEROBOT:
+    if checkpoint.config.get("type") == GROOT:
+        options = archs.groot_as_published(checkpoint, options)
+    elif checkpoint.layout == LEROBOT:
         archs.told_by_tensors(checkpoint)
     archs.check_options(checkpoint.layout, checkpoint.config, options)
     arch = archs.arch_of(checkpoint.config, checkpoint.layout, options.variant)

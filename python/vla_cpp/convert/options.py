@@ -41,7 +41,7 @@ COMMON = (
         "folder with the backbone's config.json and tokenizer.json, where they live elsewhere, or hub:OWNER/NAME@REVISION",
         "DIR",
     ),
-    Option("--base", "the policy that a LoRA adapter was trained on, where adapter_config.json names no folder, or " + HUB, "DIR"),
+    Option("--base", "the policy that a LoRA adapter was trained on, where adapter_config.json names no folder, or LeRobot's GR00T, or " + HUB, "DIR"),
     Option(
         "--dtype", "storage of matrices and tables; vectors and statistics are always f32", choices=("f32", "bf16", "f16", STORED, *CODES)
     ),

@@ -84,16 +84,16 @@ def _module(name):
     return importlib.import_module("." + name, __name__)
 
 
-# Types of LeRobot whose policies are read in another layout.
-OTHER_LAYOUTS = {"groot": "a fine-tune of GR00T as LeRobot saves it is not read yet, GR00T as its authors publish it is"}
-
-
 def load(name):
     """The module of an architecture. Errors: unsupported."""
     if name not in names():
-        hint = OTHER_LAYOUTS.get(str(name), "")
-        raise refuse("config.json: type", "one of " + ", ".join(names()), str(name), hint, Code.UNSUPPORTED)
+        raise refuse("config.json: type", "one of " + ", ".join(names()), str(name), "", Code.UNSUPPORTED)
     return _module(name)
+
+
+def groot_as_published(checkpoint: Checkpoint, options: Options) -> Options:
+    """Of LeRobot's GR00T: the checkpoint in the authors' layout."""
+    return _module("gr00t.lerobot_layout").as_published(checkpoint, options)
 
 
 LAYOUTS = {

@@ -13,7 +13,7 @@ from ... import recipe
 from ...bundle import Key
 from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
-from ...files import member, read_json
+from ...files import member
 from ...layers import Rows
 from ...networks import MAX_LAYERS, keys_of
 from ...section import Fixed, Section
@@ -113,7 +113,7 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     folder = find_backbone(checkpoint, options.backbone, checkpoint.config.get("model_name"), "model_name")
     s = read_sizes(release, checkpoint.config, folder, problems)
     s.embodiment = embodiment_index(checkpoint, options.embodiment, release.embodiments, s.n_embodiment, problems)
-    statistics = read_json(processor_file(checkpoint, STATISTICS))
+    statistics = processor_file(checkpoint, STATISTICS)
     robot = read_robot(options.embodiment, robot_config, statistics, processor, s.horizon, problems)
     if not release.cuts_rows:
         _check_horizon(robot_config, s, options, problems)
@@ -145,7 +145,7 @@ def described(release: Release, checkpoint: Checkpoint) -> List[str]:
     problems = Problems(checkpoint.name)
     configs = member(_processor(release, checkpoint, problems).values, "modality_configs", dict, PROCESSOR)
     problems.raise_any()
-    statistics = read_json(processor_file(checkpoint, STATISTICS))
+    statistics = processor_file(checkpoint, STATISTICS)
     checkpoint.notes += ["{}: left out, {} has no statistics".format(tag, STATISTICS) for tag in configs if tag not in statistics]
     return [tag for tag in configs if tag in statistics]
 
@@ -187,7 +187,7 @@ def assemble(parts: Parts, keys: List[Key], rows: Rows, checkpoint: Checkpoint, 
 
 
 def _processor(release: Release, checkpoint: Checkpoint, problems: Problems) -> Section:
-    config = read_json(processor_file(checkpoint, PROCESSOR))
+    config = processor_file(checkpoint, PROCESSOR)
     name = release.model_type + "Processor"
     if config.get("processor_class") != name:
         problems.unsupported(PROCESSOR + ": processor_class", repr(name), repr(config.get("processor_class")))

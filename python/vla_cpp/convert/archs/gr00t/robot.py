@@ -67,15 +67,17 @@ class Robot(NamedTuple):
     n_moment: int = 1  # time steps of the state; the groups of each follow those of the previous one
 
 
-def processor_file(checkpoint: Checkpoint, name: str) -> str:
+def processor_file(checkpoint: Checkpoint, name: str) -> dict:
     """Beside the weights or below processor/. Errors: bad_bundle where both exist, io where none does."""
+    if name in checkpoint.documents:
+        return checkpoint.documents[name]
     places = [place for place in (name, os.path.join("processor", name)) if os.path.exists(checkpoint.path(place))]
     if len(places) > 1:
         raise refuse(checkpoint.folder, "{} once".format(name), " and ".join(places), "remove the one that is not the policy's")
     if not places:
         hint = "it lies beside the weights, or below processor/, of the published checkpoint"
         raise refuse(checkpoint.path(name), "a file", "none", hint, Code.IO)
-    return checkpoint.path(places[0])
+    return read_json(checkpoint.path(places[0]))
 
 
 def _keys(config: dict, modality: str) -> List[str]:
@@ -101,7 +103,7 @@ def choose(configs: dict, tag: str) -> dict:
 def embodiment_index(checkpoint: Checkpoint, tag: str, built_in: Dict[str, int], n_embodiment: int, problems: Problems) -> int:
     """The row of the weights that belongs to a tag. `built_in`: what the authors' processor gives to tags that
     embodiment_id.json does not have."""
-    stated = read_json(processor_file(checkpoint, EMBODIMENTS))
+    stated = processor_file(checkpoint, EMBODIMENTS)
     if tag not in stated and tag in built_in:
         checkpoint.notes.append("{} has no {}: index {}, as in the authors' table".format(EMBODIMENTS, tag, built_in[tag]))
     index = stated.get(tag, built_in.get(tag))
