@@ -19,12 +19,17 @@ inline const std::array<float, 256>& byte_table() {
   return table;
 }
 
-/// Converts interleaved bytes to planes of bytes / 255.
-inline void spread_bytes(std::span<const std::uint8_t> rgb, std::span<float> out) {
-  const auto& table = byte_table();
+/// Converts interleaved pixels to planes of what `value` makes of each.
+template <class T, class Value>
+void spread(std::span<const T> rgb, std::span<float> out, Value value) {
   const std::size_t size = rgb.size() / 3;
   for (std::size_t i = 0; i < size; ++i)
-    for (std::size_t c = 0; c < 3; ++c) out[c * size + i] = table[rgb[3 * i + c]];
+    for (std::size_t c = 0; c < 3; ++c) out[c * size + i] = value(rgb[3 * i + c]);
+}
+
+/// Converts interleaved bytes to planes of bytes / 255.
+inline void spread_bytes(std::span<const std::uint8_t> rgb, std::span<float> out) {
+  spread(rgb, out, [&table = byte_table()](std::uint8_t byte) { return table[byte]; });
 }
 
 /// Pixels in [0, 1] times 255, without rounding; recovers bytes that were divided by 255.

@@ -406,3 +406,24 @@ TEST_CASE("views behind the instruction are found from the end of the prompt, wh
   seen.text = std::string(200, 'x');
   CHECK(contains(refusal(processor.encode(seen), Code::bad_observation), "shorten the instruction"));
 }
+
+TEST_CASE("floats come as they are where no op changes a pixel, and are refused where one does") {
+  Json recipe = Json::parse(kRecipe);
+  recipe["image"] = {{{"op", "camera_size"}, {"width", 2}, {"height", 1}},
+                     {{"op", "size"}, {"width", 2}, {"height", 1}}};
+  const auto taken = parse_recipe(recipe.dump());
+  REQUIRE(taken.ok());
+  const Frame frame{2, 1, std::vector<float>{0.1f, 0.2f, 0.3f, 0.4f, 0.5f, 0.6f}};
+  std::vector<float> out(6);
+  REQUIRE(taken->fit->apply(frame, out, "view").ok());
+  CHECK(out == std::vector<float>{0.1f, 0.4f, 0.2f, 0.5f, 0.3f, 0.6f});
+  const Frame other{1, 2, std::vector<float>(6)};
+  CHECK(contains(taken->fit->apply(other, out, "view").error().message(), "expected an image of 2 x 1"));
+  const Json pad = {{"op", "square_pad"}};
+  recipe["image"].insert(recipe["image"].begin() + 1, pad);
+  recipe["image"][2]["height"] = 2;
+  const auto padded = parse_recipe(recipe.dump());
+  REQUIRE(padded.ok());
+  std::vector<float> square(12);
+  CHECK(contains(padded->fit->apply(frame, square, "view").error().message(), "expected pixels of 8 bits"));
+}

@@ -113,13 +113,20 @@ Image applied(const ByteOp& op, const Image& from, int width, int height) {
   return centred(from, width, height);
 }
 
+/// Whether frames of the stated camera are the images, since no op changes a pixel.
+bool keeps_pixels(const Pipeline& pipeline) {
+  return !pipeline.ops.empty() && std::all_of(pipeline.ops.begin(), pipeline.ops.end(), [](const ByteOp& op) {
+    return std::holds_alternative<CameraSize>(op) || std::holds_alternative<ExpectSize>(op);
+  });
+}
+
 }  // namespace
 
 Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where) {
-  const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb);
-  if (bytes == nullptr)
+  const auto* floats = std::get_if<std::vector<float>>(&frame.rgb);
+  if (floats != nullptr && !keeps_pixels(pipeline))
     return Error{Code::bad_observation, where, "pixels of 8 bits", "float pixels",
-                 "send the camera's bytes: this policy's images are resized as bytes"};
+                 "send the camera's bytes: this policy's images are cut and resized as bytes"};
   for (const ByteOp& op : pipeline.ops)
     if (const auto* camera = std::get_if<CameraSize>(&op)) VLA_CHECK(check_camera(frame, *camera, where));
   // All sizes come before any image, so that none is made which nothing needs or no memory holds.
@@ -149,7 +156,11 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   }
   if (!fits || sizes.back() != Size{static_cast<double>(pipeline.width), static_cast<double>(pipeline.height)})
     return another_aspect(pipeline.width, pipeline.height);
-  Image image{frame.width, frame.height, *bytes};
+  if (floats != nullptr) {
+    spread(std::span(*floats), out, [](float value) { return value; });
+    return {};
+  }
+  Image image{frame.width, frame.height, std::get<std::vector<std::uint8_t>>(frame.rgb)};
   for (std::size_t i = 0; i < pipeline.ops.size(); ++i)
     image =
         applied(pipeline.ops[i], image, static_cast<int>(sizes[i + 1].width), static_cast<int>(sizes[i + 1].height));

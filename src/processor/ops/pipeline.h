@@ -76,10 +76,10 @@ struct Pipeline {
   std::vector<ByteOp> ops;
 };
 
-/// Writes (3, height, width) float32 to `out`: the resulting bytes, divided by 255. A frame of floats is refused,
-/// since the reference gets bytes, and so is one whose aspect leads to another size than the network takes.
-/// Source: lerobot policies/groot/processor_groot.py (_transform_n1_7_image_for_vlm_albumentations).
-/// Errors: bad_observation.
+/// Writes (3, height, width) float32 to `out`: the resulting bytes, divided by 255. A frame of floats comes as it is
+/// where no op changes a pixel, and is refused otherwise, since the reference gets bytes; so is one whose aspect leads
+/// to another size than the network takes. Source: lerobot policies/groot/processor_groot.py
+/// (_transform_n1_7_image_for_vlm_albumentations). Errors: bad_observation.
 Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where);
 
 /// Checks that a frame is of the camera whose frames alone are taken. Errors: bad_observation.
