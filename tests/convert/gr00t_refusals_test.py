@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What of GR00T N1.7 checkpoints is refused, or asked for."""
 
+from pathlib import Path
+
 import pytest
 
 from tiny import REMOVED, changed, write_json
@@ -234,13 +236,32 @@ def test_the_backbones_image_processor_is_needed(converter):
     assert converter.refusal(tiny, embodiment=TAG).code == Code.IO
 
 
+TURNS = (Path(__file__).resolve().parents[1] / "golden/tokenizers/gr00t/chat_template.jinja").read_text()
+
+
 @pytest.mark.parametrize(
-    "template", ["{{ text }}", "You are a helpful assistant<|vision_start|><|image_pad|><|vision_end|>"]
+    "template",
+    [
+        "{{ text }}",
+        "<|im_start|>system\nYou are terse.<|im_end|>\n" + TURNS,
+        TURNS.replace("{{ part.text }}", "{{ part.text | trim }}"),
+        TURNS.replace("<|image_pad|>", "Picture: <|image_pad|>"),
+        TURNS.replace("<|im_start|>assistant", "<|im_start|>assistant\n<think>"),
+        "{{ bos_token }}" + TURNS,
+        "{% for i in range(1000000000) %} {% endfor %}" + TURNS,
+        "{% if %}",
+    ],
 )
-def test_a_template_with_words_of_its_own_is_refused(converter, template):
+def test_a_template_that_makes_another_prompt_is_refused(converter, template):
     tiny = TinyGr00t()
     tiny.template = template
-    assert "chat_template: expected Qwen3-VL's" in converter.refusal(tiny, embodiment=TAG).message()
+    assert "chat_template.jinja: expected Qwen3-VL's" in converter.refusal(tiny, embodiment=TAG).message()
+
+
+def test_a_template_in_other_words_that_makes_the_same_prompt_is_taken(converter):
+    tiny = TinyGr00t()
+    tiny.template = "{%- set n = namespace(value=0) %}{%- if tools %}{{ raise_exception('none') }}{% endif %}" + TURNS
+    assert converter.bundle(tiny, embodiment=TAG).keys["vla.arch"] == "gr00t_n1_7"
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,10 @@ import math
 import os
 from typing import Dict, List, Mapping
 
+from ... import chat_template
 from ...ascii_bpe import special_ids
 from ...errors import Code, Problems, refuse
-from ...files import member, read_json, read_text
+from ...files import member, read_json
 from ...layers import QWEN3, Names, Rows, blocks, linear, norm, patch_embed, table
 from ...networks import MAX_LAYERS, decoder, pick
 from ...section import Fixed, Section
@@ -194,17 +195,16 @@ def _check_ids(folder: str, ids: dict, problems: Problems) -> None:
 
 
 def _check_template(folder: str, problems: Problems) -> None:
-    """The template is a program of its own; what is looked for here is what would make another prompt of one user's turn."""
-    name, text = "chat_template.jinja", None
-    if os.path.exists(os.path.join(folder, name)):
-        text = read_text(os.path.join(folder, name))
-    for name in ("chat_template.json", "tokenizer_config.json"):
-        if text is None and os.path.exists(os.path.join(folder, name)):
-            text = read_json(os.path.join(folder, name)).get("chat_template")
-    if not isinstance(text, str):
+    """The template is a program of its own: what it makes of a user's turn is compared with the prompt of the bundle."""
+    where, template = chat_template.find(folder)
+    if template is None:
         return
-    if OPEN + IMAGE + CLOSE not in text or "You are a helpful assistant" in text:
-        problems.unsupported(name + ": chat_template", "Qwen3-VL's, which puts no words of its own before a user's", repr(text[:60]))
+    for n_view, text, generates in ((1, "go", False), (3, " Pick {{ x }} up,\n now <|im_end|> \n", False), (2, "", True)):
+        wanted = TEMPLATE.before + (OPEN + IMAGE + CLOSE) * n_view + text + TEMPLATE.after + (START + "assistant\n" if generates else "")
+        found = chat_template.user_turn(template, where, n_view, text, generates)
+        if found != wanted:
+            problems.unsupported(where, "Qwen3-VL's, which makes {!r} of a user's turn".format(wanted), repr(found)[:200])
+            return
 
 
 def dropped(s: Sizes) -> List[Dropped]:
