@@ -9,7 +9,7 @@ namespace vla::cli {
 namespace {
 
 /// The act of a record that was answered with a chunk, with the answer's seed; none for other records.
-std::optional<v1::Act> answered_act(const serve::Recording::Record& record) {
+std::optional<v1::Act> answered_act(const observe::Recording::Record& record) {
   v1::Request request;
   v1::Response response;
   if (!request.ParseFromString(record.request) || !request.has_act()) return std::nullopt;
@@ -18,8 +18,8 @@ std::optional<v1::Act> answered_act(const serve::Recording::Record& record) {
   return request.act();
 }
 
-Result<serve::Recording> open_recording(const std::string& folder, const Bundle& bundle) {
-  VLA_TRY(serve::Recording recording, serve::Recording::open(folder));
+Result<observe::Recording> open_recording(const std::string& folder, const Bundle& bundle) {
+  VLA_TRY(observe::Recording recording, observe::Recording::open(folder));
   VLA_TRY(const std::string arch, bundle.keys().string("vla.arch"));
   if (const std::string& recorded = recording.description().bundle().arch(); recorded != arch)
     return Error{Code::bad_request, folder, "a recording of " + arch, "one of " + recorded};
@@ -27,7 +27,7 @@ Result<serve::Recording> open_recording(const std::string& folder, const Bundle&
 }
 
 Result<std::size_t> count(const std::string& folder, const Bundle& bundle) {
-  VLA_TRY(serve::Recording recording, open_recording(folder, bundle));
+  VLA_TRY(observe::Recording recording, open_recording(folder, bundle));
   for (std::size_t n = 0;;) {
     VLA_TRY(const auto record, recording.next());
     if (!record) return n;
@@ -52,7 +52,7 @@ Result<std::vector<Judged>> read_observations(const std::string& folder, const s
   VLA_TRY(const std::size_t n, count(folder, bundle));
   if (n == 0) return Error{Code::bad_request, folder, "acts that were answered with a chunk", "none"};
   VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(path, {.dry = true, .all_robots = true}));
-  VLA_TRY(serve::Recording recording, open_recording(folder, bundle));
+  VLA_TRY(observe::Recording recording, open_recording(folder, bundle));
   std::vector<Judged> judged;
   const std::size_t n_wanted = std::min(n, n_most);
   for (std::size_t i = 0; judged.size() < n_wanted;) {

@@ -11,10 +11,10 @@ namespace vla::cli {
 /// Decides how much freed memory malloc keeps. By itself it keeps up to 64 MB for each thread that took some, for ever.
 /// Here large blocks go back to the system as soon as they are freed, except for what the answered acts of the last
 /// half minute took: their pages would be made anew for each of them.
-class KeptMemory final : public serve::Observer {
+class KeptMemory final : public observe::Observer {
  public:
   KeptMemory() { keep(0); }
-  void answered(const serve::Answered& answered) override;
+  void answered(const observe::Answered& answered) override;
 
  private:
   void keep(std::size_t size);

@@ -17,21 +17,21 @@
 namespace vla::cli {
 namespace {
 
-using serve::Level;
+using observe::Level;
 
 /// With --log the level is info, otherwise warn.
 Level level_of(const ObservabilityOptions& options) {
-  const auto found = std::find(std::begin(serve::kLevelNames), std::end(serve::kLevelNames), options.level);
-  if (found == std::end(serve::kLevelNames)) return options.log.empty() ? Level::warn : Level::info;
-  return static_cast<Level>(found - std::begin(serve::kLevelNames));
+  const auto found = std::find(std::begin(observe::kLevelNames), std::end(observe::kLevelNames), options.level);
+  if (found == std::end(observe::kLevelNames)) return options.log.empty() ? Level::warn : Level::info;
+  return static_cast<Level>(found - std::begin(observe::kLevelNames));
 }
 
 /// Adds the ranges of a robot's states in training: extremes or, where the bundle has none, three deviations around
 /// the mean. Keys are `tag/state`.
-void add_ranges(const Robot& robot, std::map<std::string, serve::Page::Range>& ranges) {
+void add_ranges(const Robot& robot, std::map<std::string, observe::Page::Range>& ranges) {
   for (const std::string& state : robot.processor().states().names()) {
     const auto stats = [&](const char* name) { return robot.bundle().stats(fmt::format("stats.{}.{}", state, name)); };
-    serve::Page::Range range;
+    observe::Page::Range range;
     for (const auto& [low, high] : {std::pair{"min", "max"}, std::pair{"q01", "q99"}})
       if (const auto a = stats(low), b = stats(high); range.low.empty() && a && b) range = {*a, *b};
     if (const auto mean = stats("mean"), deviation = stats("std"); range.low.empty() && mean && deviation) {
@@ -52,8 +52,8 @@ std::string drawn_token() {
   return token;
 }
 
-void describe_for_page(serve::Page& page, const v1::Description& description, const Engine& engine) {
-  std::map<std::string, serve::Page::Range> ranges;
+void describe_for_page(observe::Page& page, const v1::Description& description, const Engine& engine) {
+  std::map<std::string, observe::Page::Range> ranges;
   for (const Robot* robot : engine.robots()) add_ranges(*robot, ranges);
   const auto max_pixels = static_cast<std::int64_t>(description.limits().max_pixels());
   page.describe(description, ranges, [&engine, max_pixels](const v1::Act& act, int view) {
@@ -87,7 +87,8 @@ void add_observability_options(CLI::App& command, ObservabilityOptions& options)
 
 Observability::Observability(const ObservabilityOptions& options, const serve::Server& server)
     : server_(server),
-      log_(STDERR_FILENO, options.log == "json" ? serve::LogFormat::json : serve::LogFormat::text, level_of(options)) {}
+      log_(STDERR_FILENO, options.log == "json" ? observe::LogFormat::json : observe::LogFormat::text,
+           level_of(options)) {}
 
 Result<std::unique_ptr<Observability>> Observability::start(const ObservabilityOptions& options,
                                                             const serve::Server& server, bool insecure) {
@@ -103,20 +104,20 @@ Result<std::unique_ptr<Observability>> Observability::start(const ObservabilityO
 
 Status Observability::open(const ObservabilityOptions& options, bool insecure) {
   if (!options.trace.empty()) {
-    VLA_TRY(trace_, serve::Trace::open(options.trace));
+    VLA_TRY(trace_, observe::Trace::open(options.trace));
   }
   if (!options.metrics.empty()) {
-    metrics_ = std::make_unique<serve::Metrics>();
-    VLA_TRY(monitor_, serve::Monitor::open(options.metrics, insecure,
-                                           {[this] { return metrics_->text(server_.health()); },
-                                            [this] { return not_ready_reason(); }}));
+    metrics_ = std::make_unique<observe::Metrics>();
+    VLA_TRY(monitor_, observe::Monitor::open(options.metrics, insecure,
+                                             {[this] { return metrics_->text(server_.health()); },
+                                              [this] { return not_ready_reason(); }}));
   }
   if (!options.record.empty()) {
-    recordings_ = std::make_unique<serve::Recordings>(options.record, options.record_limit_mb * 1'000'000);
-    recordings_->on_change([this](const serve::Recordings::Standing& recording) { log_recording(recording); });
+    recordings_ = std::make_unique<observe::Recordings>(options.record, options.record_limit_mb * 1'000'000);
+    recordings_->on_change([this](const observe::Recordings::Standing& recording) { log_recording(recording); });
   }
   if (!options.page.empty()) {
-    VLA_TRY(page_, serve::Page::open(
+    VLA_TRY(page_, observe::Page::open(
                        options.page, insecure,
                        {drawn_token(), serve::is_same_secret, [this] { return server_.health(); }, recordings_.get()}));
   }
@@ -124,7 +125,7 @@ Status Observability::open(const ObservabilityOptions& options, bool insecure) {
   return recordings_ && !options.record_paused ? recordings_->open() : Status();
 }
 
-void Observability::log_recording(const serve::Recordings::Standing& recording) {
+void Observability::log_recording(const observe::Recordings::Standing& recording) {
   if (recording.why.empty())
     log_.event(Level::info, "recording",
                {{"on", recording.on}, {"folder", recording.folder}, {"requests", recording.n_request}});
@@ -139,7 +140,7 @@ Observability::~Observability() {
 /// Requests that come between the ready line and the first turn of the server wait for it: it is ready.
 std::string Observability::not_ready_reason() const {
   if (const char* phase = phase_) return phase;
-  const serve::Health health = server_.health();
+  const observe::Health health = server_.health();
   return health.ready || health.uptime_s == 0 ? "" : "draining";
 }
 
@@ -176,16 +177,16 @@ void Observability::ready(double warm_up_ms) {
 }
 
 void Observability::ended(const Status& status) {
-  const serve::Health health = server_.health();
-  serve::Log::Fields fields = {{"chunks", health.n_chunk}, {"errors", health.n_error}, {"uptime_s", health.uptime_s}};
+  const observe::Health health = server_.health();
+  observe::Log::Fields fields = {{"chunks", health.n_chunk}, {"errors", health.n_error}, {"uptime_s", health.uptime_s}};
   if (!status) fields.emplace_back("error", status.error().message());
   log_.event(status ? Level::info : Level::error, "shutdown", fields);
 }
 
-std::vector<serve::Observer*> Observability::observers() {
-  std::vector<serve::Observer*> all;
-  for (serve::Observer* observer :
-       std::initializer_list<serve::Observer*>{&log_, metrics_.get(), trace_.get(), recordings_.get(), page_.get()})
+std::vector<observe::Observer*> Observability::observers() {
+  std::vector<observe::Observer*> all;
+  for (observe::Observer* observer :
+       std::initializer_list<observe::Observer*>{&log_, metrics_.get(), trace_.get(), recordings_.get(), page_.get()})
     if (observer != nullptr) all.push_back(observer);
   return all;
 }

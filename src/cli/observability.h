@@ -30,7 +30,7 @@ std::string drawn_token();
 
 /// How a policy that is loaded is shown: where its states were in training, and how it sees. The engine outlives the
 /// page.
-void describe_for_page(serve::Page& page, const v1::Description& description, const Engine& engine);
+void describe_for_page(observe::Page& page, const v1::Description& description, const Engine& engine);
 
 void add_observability_options(CLI::App& command, ObservabilityOptions& options);
 
@@ -52,7 +52,7 @@ class Observability {
   /// How the server ended. The log says so.
   void ended(const Status& status);
 
-  std::vector<serve::Observer*> observers();
+  std::vector<observe::Observer*> observers();
   /// The address where HTTP listens; empty where it does not.
   std::string metrics_address() const { return monitor_ ? monitor_->address() : std::string(); }
   /// The URL of the page, with its token; empty where there is none.
@@ -62,16 +62,16 @@ class Observability {
   Observability(const ObservabilityOptions& options, const serve::Server& server);
   Status open(const ObservabilityOptions& options, bool insecure);
   std::string not_ready_reason() const;
-  void log_recording(const serve::Recordings::Standing& recording);
+  void log_recording(const observe::Recordings::Standing& recording);
 
   const serve::Server& server_;
   std::atomic<const char*> phase_ = "loading";  // null: serving
-  serve::Log log_;
-  std::unique_ptr<serve::Metrics> metrics_;
-  std::unique_ptr<serve::Trace> trace_;
-  std::unique_ptr<serve::Recordings> recordings_;
-  std::unique_ptr<serve::Page> page_;
-  std::unique_ptr<serve::Monitor> monitor_;  // last: asks the others
+  observe::Log log_;
+  std::unique_ptr<observe::Metrics> metrics_;
+  std::unique_ptr<observe::Trace> trace_;
+  std::unique_ptr<observe::Recordings> recordings_;
+  std::unique_ptr<observe::Page> page_;
+  std::unique_ptr<observe::Monitor> monitor_;  // last: asks the others
 };
 
 }  // namespace vla::cli

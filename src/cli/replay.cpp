@@ -26,7 +26,7 @@ struct ReplayOptions {
   double speed = 1;
   int n_thread = 0;
   std::vector<std::string> absent;
-  serve::ReplayOptions replay;
+  observe::ReplayOptions replay;
 };
 
 /// Another bundle or other arithmetic may rightly give other answers, so the table says so.
@@ -42,16 +42,16 @@ void announce(const v1::Description& recorded, const v1::Description& replayed) 
   row("kernels", recorded.runtime().kernels(), replayed.runtime().kernels());
 }
 
-Status report(const serve::Recording& recording, const serve::ReplayReport& report) {
+Status report(const observe::Recording& recording, const observe::ReplayReport& report) {
   announce(recording.description(), report.replayed_by);
   if (!report.differences.empty())
     say(stdout, "{:>8}  {:>20}  {:<15}  {}\n", "request", "id", "field", "recorded -> replayed");
-  for (const serve::Difference& d : report.differences)
+  for (const observe::Difference& d : report.differences)
     say(stdout, "{:>8}  {:>20}  {:<15}  {} -> {}\n", d.index, d.request_id, d.field, d.recorded, d.replayed);
   say(stdout, "{} answers the same, {} different, {} not compared\n", report.n_same, report.n_different,
       report.n_skipped);
   if (report.differences.empty()) return {};
-  const serve::Difference& first = report.differences.front();
+  const observe::Difference& first = report.differences.front();
   return Error{Code::mismatch, fmt::format("request {}: {}", first.index, first.field), first.recorded, first.replayed,
                fmt::format("{} answers differ; this is the first", report.n_different)};
 }
@@ -73,7 +73,7 @@ Result<serve::ServerOptions> limits_of(const v1::Limits& limits) {
 }
 
 /// Serves the bundle in this process, as `vla serve` would, for the time of the replay.
-Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOptions& options) {
+Result<observe::ReplayReport> replay_bundle(observe::Recording& recording, ReplayOptions& options) {
   VLA_TRY(const serve::ServerOptions limits, limits_of(recording.description().limits()));
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(limits));
   VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
@@ -85,9 +85,9 @@ Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOpt
   VLA_CHECK(server->add(recording.description().policy(), std::move(engine)));
   VLA_CHECK(server->begin());
   options.replay.address = server->addresses().front();
-  std::optional<Result<serve::ReplayReport>> result;
+  std::optional<Result<observe::ReplayReport>> result;
   VLA_TRY(std::thread client, start_thread("replay", [&]() noexcept {
-            result = serve::replay(recording, options.replay);
+            result = observe::replay(recording, options.replay);
             server->stop();
           }));
   const Status served = server->run();
@@ -113,13 +113,13 @@ Result<std::unique_ptr<Engine>> open_recorded(const v1::Description& recorded, c
 }
 
 /// Shows the recording at the pace at which it came, and its acts until the process is ended.
-Status show(serve::Recording& recording, const ReplayOptions& options) {
+Status show(observe::Recording& recording, const ReplayOptions& options) {
   std::atomic<std::uint64_t> n_shown = 0;
-  const auto health = [&n_shown] { return serve::Health{.ready = true, .n_chunk = n_shown}; };
+  const auto health = [&n_shown] { return observe::Health{.ready = true, .n_chunk = n_shown}; };
   const v1::Description& description = recording.description();
   std::unique_ptr<Engine> engine;
-  VLA_TRY(const std::unique_ptr<serve::Page> page,
-          serve::Page::open(
+  VLA_TRY(const std::unique_ptr<observe::Page> page,
+          observe::Page::open(
               options.page, false,
               {.token = drawn_token(), .is_same = serve::is_same_secret, .health = health, .is_server = false}));
   page->describe(description, {}, {});
@@ -132,7 +132,7 @@ Status show(serve::Recording& recording, const ReplayOptions& options) {
   std::fflush(stdout);
   std::optional<std::uint64_t> first_ns;
   for (const auto start = Clock::now(); options.replay.first == 0 || n_shown < options.replay.first;) {
-    VLA_TRY(const std::optional<serve::Recording::Record> record, recording.next());
+    VLA_TRY(const std::optional<observe::Recording::Record> record, recording.next());
     if (!record) break;
     first_ns = std::min(first_ns.value_or(record->at_ns), record->at_ns);
     const auto after = std::chrono::duration<double, std::nano>(static_cast<double>(record->at_ns - *first_ns));
@@ -145,11 +145,11 @@ Status show(serve::Recording& recording, const ReplayOptions& options) {
 }
 
 Status replay(ReplayOptions& options) {
-  VLA_TRY(serve::Recording recording, serve::Recording::open(options.folder));
+  VLA_TRY(observe::Recording recording, observe::Recording::open(options.folder));
   if (!options.page.empty()) return show(recording, options);
   if (!options.connect.empty()) options.replay.address = options.connect;
-  VLA_TRY(const serve::ReplayReport result,
-          options.bundle.empty() ? serve::replay(recording, options.replay) : replay_bundle(recording, options));
+  VLA_TRY(const observe::ReplayReport result,
+          options.bundle.empty() ? observe::replay(recording, options.replay) : replay_bundle(recording, options));
   if (options.replay.first == 0 && !recording.is_whole())
     say(stdout, "note: the recording has no end: its server was killed, or the file was cut between two requests\n");
   return report(recording, result);

@@ -20,7 +20,7 @@
 #include "net/listener.h"
 #include "net/tcp.h"
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 namespace beast = boost::beast;
@@ -159,4 +159,4 @@ Result<std::unique_ptr<Http>> Http::open(const std::string& address, const char*
   return std::unique_ptr<Http>(new Http(std::move(server)));
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -8,7 +8,7 @@
 
 #include "base/result.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 struct HttpReply {
   int status = 200;
@@ -40,4 +40,4 @@ class Http {
   std::unique_ptr<Server> server_;
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

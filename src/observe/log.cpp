@@ -9,7 +9,7 @@
 #include <ctime>
 #include <exception>
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 constexpr std::size_t kMaxLogBacklog = 1 << 20;
@@ -181,4 +181,4 @@ void Log::dropped(const Dropped& connection) {
   }
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -8,7 +8,7 @@
 #include "observe/observer.h"
 #include "observe/writer.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 enum class Level { debug, info, warn, error };
 constexpr const char* kLevelNames[] = {"debug", "info", "warn", "error"};
@@ -57,4 +57,4 @@ class Log final : public Observer {
   Clock::time_point told_at_ = Clock::now();
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

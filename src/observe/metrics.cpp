@@ -9,7 +9,7 @@
 
 #include "base/process.h"
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 const prometheus::Histogram::BucketBoundaries kSeconds = {1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 0.01, 0.025,
@@ -131,4 +131,4 @@ void Metrics::observe(const std::string& stage, double seconds) {
   histogram->Observe(seconds);
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

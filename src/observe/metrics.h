@@ -15,7 +15,7 @@
 #include "observe/observer.h"
 #include "wire/vla.pb.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 /// Counts and times requests for Prometheus. docs/serving.md lists the metrics. Label values come from the server,
 /// never from a client, so their number is bounded.
@@ -51,4 +51,4 @@ class Metrics final : public Observer {
   std::map<std::pair<Kind, int>, prometheus::Counter*> request_;
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

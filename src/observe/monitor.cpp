@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "observe/monitor.h"
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 HttpReply reply_to(const Monitor::Sources& sources, const std::string& path) {
@@ -24,4 +24,4 @@ Result<std::unique_ptr<Monitor>> Monitor::open(const std::string& address, bool 
   return std::unique_ptr<Monitor>(new Monitor(std::move(http)));
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

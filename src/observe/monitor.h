@@ -4,7 +4,7 @@
 
 #include "observe/http.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 /// HTTP for monitoring programs: `/metrics`, `/healthz` (200 while the process lives) and `/readyz` (200 while acts are
 /// taken, else 503 with the reason).
@@ -24,4 +24,4 @@ class Monitor {
   std::unique_ptr<Http> http_;
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -12,7 +12,7 @@
 #include "engine/timing.h"
 #include "wire/envelope.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 using wire::Kind;
 using wire::kind_name;
@@ -75,4 +75,4 @@ struct Health {
   std::uint64_t n_chunk = 0, n_error = 0;  // requests answered with a chunk, with an error
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

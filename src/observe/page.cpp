@@ -12,7 +12,7 @@
 #include "wire/envelope.h"
 #include "wire/fields.h"
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 using Json = nlohmann::ordered_json;
@@ -430,4 +430,4 @@ HttpReply Page::image(std::uint64_t id, std::size_t number, bool as_seen) {
   return {.type = "image/" + kind, .body = text_of(view->bytes)};
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -14,7 +14,7 @@
 #include "observe/recordings.h"
 #include "wire/vla.pb.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 /// A live page for people: `/` is the page, which asks `/policy` once, `/acts?after=N` for what was answered since, and
 /// `/image?act=N&view=I` for frames, `&as=seen` for what the network got of them. POST to `/record?on=1` or `on=0`
@@ -83,4 +83,4 @@ class Page final : public Observer {
   std::unique_ptr<Http> http_;  // last: its thread asks the others
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

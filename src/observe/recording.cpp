@@ -11,7 +11,7 @@
 #include <filesystem>
 #include <limits>
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 constexpr std::string_view kMagic = "VLAREC2\n";
@@ -186,4 +186,4 @@ Result<std::optional<Recording::Record>> Recording::next() {
   return std::optional<Record>(std::move(record));
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -12,7 +12,7 @@
 #include "observe/writer.h"
 #include "wire/vla.pb.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 /// Requests and their answers as they went over the wire, in one file of a folder, in the order of the answers.
 /// The file: 8 bytes `VLAREC2\n`, then records. A record is a mark of 4 bytes (`VREC`, or `VEND` for the last one),
@@ -89,4 +89,4 @@ class Recording {
   v1::Description description_;
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -8,7 +8,7 @@
 #include <algorithm>
 #include <chrono>
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 Error refused(const char* expected, const char* found) { return {Code::usage, "recording", expected, found}; }
@@ -97,4 +97,4 @@ Recordings::Standing Recordings::now() const {
   return standing;
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

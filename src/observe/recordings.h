@@ -10,7 +10,7 @@
 
 #include "observe/recording.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 /// A server's recordings, one at a time: optionally one in the folder itself from the start, and one in a subfolder
 /// named by its time whenever a person starts another. Any thread may call.
@@ -60,4 +60,4 @@ class Recordings final : public Observer {
   Standing last_;                       // bytes of closed recordings
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -16,7 +16,7 @@
 #include "wire/envelope.h"
 #include "wire/interface.h"
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 const char* name_of(v1::Response::KindCase kind) {
@@ -219,4 +219,4 @@ Result<ReplayReport> replay(Recording& recording, const ReplayOptions& options) 
   }
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -4,7 +4,7 @@
 
 #include "observe/recording.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 struct ReplayOptions {
   std::string address = "tcp://127.0.0.1:5555";
@@ -36,4 +36,4 @@ std::vector<Difference> compare_answers(const v1::Response& recorded, const v1::
 /// Recording::next.
 Result<ReplayReport> replay(Recording& recording, const ReplayOptions& options);
 
-}  // namespace vla::serve
+}  // namespace vla::observe

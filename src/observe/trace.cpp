@@ -13,7 +13,7 @@
 
 #include "base/file.h"
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 constexpr std::size_t kMaxTraceBacklog = 16 << 20;
@@ -130,4 +130,4 @@ void Trace::answered(const Answered& answered) {
   }
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -8,7 +8,7 @@
 #include "observe/observer.h"
 #include "observe/writer.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 /// Events for Perfetto and chrome://tracing: a track of each request from receipt to answer with its time in the queue,
 /// and the acts of the engine with their stages. Streams to the file: an array that is whole also where the disk is
@@ -36,4 +36,4 @@ class Trace final : public Observer {
   Writer writer_;
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -15,7 +15,7 @@
 
 #include "base/thread.h"
 
-namespace vla::serve {
+namespace vla::observe {
 namespace {
 
 constexpr auto kPatience = std::chrono::seconds(2);  // with a pipe without a reader, at shutdown
@@ -134,4 +134,4 @@ void Writer::write_tail() {
   }
 }
 
-}  // namespace vla::serve
+}  // namespace vla::observe

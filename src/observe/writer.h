@@ -13,7 +13,7 @@
 
 #include "base/result.h"
 
-namespace vla::serve {
+namespace vla::observe {
 
 /// Opens a file to be written from its start, which must not exist yet where `fresh`. Only its owner may read it, since
 /// it holds what a robot sees and does. A symbolic link is refused: another user may have put it there. Errors: io.
@@ -65,4 +65,4 @@ class Writer {
   std::thread thread_;
 };
 
-}  // namespace vla::serve
+}  // namespace vla::observe

@@ -16,6 +16,9 @@
 
 namespace vla::serve {
 
+using observe::Answered, observe::Dropped, observe::Health, observe::Observer, observe::Received;
+using wire::Kind, wire::kind_name;
+
 class Io;
 
 /// The answer of the engine to an act.

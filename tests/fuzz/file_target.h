@@ -22,7 +22,7 @@ enum class FileKind { recording, taps, keys };
 inline bool check_file(FileKind kind, std::string_view bytes, const std::string& folder) {
   const Budget budget(10, 512);
   std::filesystem::create_directories(folder);
-  const std::string file = folder + "/" + (kind == FileKind::recording ? serve::kRecordingFile : "file");
+  const std::string file = folder + "/" + (kind == FileKind::recording ? observe::kRecordingFile : "file");
   std::ofstream(file, std::ios::binary | std::ios::trunc)
       .write(bytes.data(), static_cast<std::streamsize>(bytes.size()));
   const auto refuse = [](const Error& error) {
@@ -39,7 +39,7 @@ inline bool check_file(FileKind kind, std::string_view bytes, const std::string&
     const auto taps = read_taps(file);
     return taps ? true : refuse(taps.error());
   }
-  auto recording = serve::Recording::open(folder);
+  auto recording = observe::Recording::open(folder);
   if (!recording) return refuse(recording.error());
   for (std::size_t n = 0; n <= bytes.size(); ++n) {
     const auto piece = recording->next();

@@ -13,7 +13,7 @@ namespace vla::fuzz {
 
 /// What became of a request: whether it was sound, and of which kind.
 struct RequestFate {
-  serve::Kind kind = serve::Kind::unknown;
+  observe::Kind kind = observe::Kind::unknown;
   bool sound = false;
 };
 
@@ -35,13 +35,13 @@ inline RequestFate check_request(std::span<const std::byte> bytes) {
   const Status read = wire::read_envelope(bytes, envelope);
   fate.kind = envelope.kind;
   if (!read) return refuse(read.error()), fate;
-  if (envelope.kind == serve::Kind::hello) {
+  if (envelope.kind == observe::Kind::hello) {
     const auto reply = serve::answer_hello(envelope.body(bytes));
     if (!reply) return refuse(reply.error()), fate;
-  } else if (envelope.kind == serve::Kind::describe) {
+  } else if (envelope.kind == observe::Kind::describe) {
     const auto name = serve::read_describe(envelope.body(bytes));
     if (!name) return refuse(name.error()), fate;
-  } else if (envelope.kind != serve::Kind::act) {
+  } else if (envelope.kind != observe::Kind::act) {
     const Status empty = serve::check_empty(envelope.body(bytes));
     if (!empty) return refuse(empty.error()), fate;
   } else {

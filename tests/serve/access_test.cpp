@@ -49,9 +49,9 @@ TEST_CASE("with keys, a listed client is served and every other one is not") {
   options.curve_secret = prefix + ".server.secret";
   CHECK(serve::Server::open(options).error().where == "--curve-secret");
   options.curve_clients = prefix + ".friend.public";
-  struct Names : serve::Observer {  // who is there, as the server sees it
+  struct Names : observe::Observer {  // who is there, as the server sees it
     std::set<std::string> peers;
-    void received(const serve::Received& request) override { peers.insert(request.peer); }
+    void received(const observe::Received& request) override { peers.insert(request.peer); }
   } names;
   Running running(options, {&names});
   const auto connect = [&](const std::string& who) {

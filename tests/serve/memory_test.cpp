@@ -96,16 +96,16 @@ std::string read(const std::string& file) {
 struct Watched {
   char folder[32] = "/tmp/vla_memory_XXXXXX";
   int nowhere = ::open("/dev/null", O_WRONLY | O_CLOEXEC);
-  serve::Metrics metrics;
-  std::optional<serve::Log> log;
-  std::unique_ptr<serve::Trace> trace;
-  std::unique_ptr<serve::Recorder> recorder;
+  observe::Metrics metrics;
+  std::optional<observe::Log> log;
+  std::unique_ptr<observe::Trace> trace;
+  std::unique_ptr<observe::Recorder> recorder;
 
   Watched() {
     REQUIRE(mkdtemp(folder) != nullptr);
-    log.emplace(nowhere, serve::LogFormat::json, serve::Level::debug);
-    trace = std::move(*serve::Trace::open(folder + std::string("/trace.json")));
-    recorder = std::move(*serve::Recorder::open(folder + std::string("/recording"), 1 << 30));
+    log.emplace(nowhere, observe::LogFormat::json, observe::Level::debug);
+    trace = std::move(*observe::Trace::open(folder + std::string("/trace.json")));
+    recorder = std::move(*observe::Recorder::open(folder + std::string("/recording"), 1 << 30));
   }
   ~Watched() {
     recorder.reset();
@@ -114,7 +114,7 @@ struct Watched {
     ::close(nowhere);
     std::filesystem::remove_all(folder);
   }
-  std::vector<serve::Observer*> all() { return {&metrics, &*log, trace.get(), recorder.get()}; }
+  std::vector<observe::Observer*> all() { return {&metrics, &*log, trace.get(), recorder.get()}; }
 };
 
 struct Server {

@@ -42,7 +42,7 @@ serve::Names names(const std::vector<std::string>& lines, const std::string& pre
 const std::vector<std::string> kLines = {"observation/image=image", "observation/wrist_image=wrist",
                                          "observation/state=arm"};
 
-Result<Observation> observe(const std::string& message, const serve::Names& by) {
+Result<Observation> read_act(const std::string& message, const serve::Names& by) {
   static std::string kept;
   kept = message;
   const auto value = msgpack::read(bytes_of(kept));
@@ -179,7 +179,7 @@ TEST_CASE("arrays that are not what they say are refused") {
 TEST_CASE("degrees become radians, a flipped gripper 1 - x, and actions come back the other way") {
   const std::string message = seed_of("openpi/act");
   auto by = names({kLines[0], kLines[1], "observation/state=arm,degrees"});
-  const auto observation = observe(message, by);
+  const auto observation = read_act(message, by);
   REQUIRE_MESSAGE(observation.ok(), (observation ? "" : observation.error().message()));
   CHECK(observation->states.at("state.arm")[2] == doctest::Approx(2 * 3.14159265 / 180));
   by = names({kLines[0], kLines[1], kLines[2], "actions=0:2,degrees", "actions=2:3,flipped"});
@@ -218,11 +218,11 @@ TEST_CASE("names that leave something out, or that fit nothing, are refused with
 
 TEST_CASE("an observation with a key that stands for nothing is refused, unless a line lets it pass") {
   const std::string message = seed_of("openpi/act");
-  const auto refused = observe(message, names({kLines[0], kLines[2], "camera=wrist"}));
+  const auto refused = read_act(message, names({kLines[0], kLines[2], "camera=wrist"}));
   REQUIRE_FALSE(refused.ok());
   CHECK(refused.error().found == "observation/wrist_image");
   CHECK(refused.error().expected.find("camera") != std::string::npos);
-  const auto passed = observe(message, names({kLines[0], kLines[2], "camera=wrist", "observation/wrist_image="}));
+  const auto passed = read_act(message, names({kLines[0], kLines[2], "camera=wrist", "observation/wrist_image="}));
   REQUIRE_MESSAGE(passed.ok(), (passed ? "" : passed.error().message()));
   CHECK(passed->views.size() == 1);
 }

@@ -26,6 +26,7 @@
 
 using namespace vla;
 using namespace vla::test;
+using namespace vla::observe;
 using namespace vla::serve;
 
 namespace {

@@ -17,6 +17,7 @@
 
 using namespace vla;
 using namespace vla::test;
+using namespace vla::observe;
 using namespace vla::serve;
 using nlohmann::json;
 

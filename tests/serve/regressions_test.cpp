@@ -34,7 +34,7 @@ TEST_CASE("requests from fuzzing are read within the limits or refused") {
 
 TEST_CASE("the requests that fuzzing starts from reach every decoder") {
   CHECK(fate(read_text(kFolder + "/act")).sound);
-  CHECK(fate(read_text(kFolder + "/act")).kind == serve::Kind::act);
+  CHECK(fate(read_text(kFolder + "/act")).kind == wire::Kind::act);
   CHECK(fate(read_text(kFolder + "/hello")).sound);
   CHECK(fate(read_text(kFolder + "/describe")).sound);
   CHECK(fate(read_text(kFolder + "/health")).sound);
@@ -66,19 +66,19 @@ TEST_CASE("damaged recordings, taps and key files are read or refused, in bounde
   const std::string folder = scratch_path("odd_files");
   std::filesystem::remove_all(folder);
   {
-    const auto recorder = serve::Recorder::open(folder, 1 << 20);
+    const auto recorder = observe::Recorder::open(folder, 1 << 20);
     REQUIRE(recorder.ok());
     (*recorder)->describe({});
     const std::string act = read_text(kFolder + "/act"), answer = "an answer";
     for (int i = 0; i < 3; ++i) {
-      serve::Answered answered;
-      answered.request.kind = serve::Kind::act;
+      observe::Answered answered;
+      answered.request.kind = wire::Kind::act;
       answered.in = std::as_bytes(std::span(act));
       answered.out = std::as_bytes(std::span(answer));
       (*recorder)->answered(answered);
     }
   }
-  const std::string recording = read_text(folder + "/" + serve::kRecordingFile);
+  const std::string recording = read_text(folder + "/" + observe::kRecordingFile);
   const std::string taps = folder + "/taps";
   REQUIRE(write_taps({{"a", {2, 3}, {1, 2, 3, 4, 5, 6}}, {"b", {1}, {7}}}, taps).ok());
   const std::string key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7";

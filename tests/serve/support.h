@@ -108,9 +108,9 @@ inline void check_serves(Peer& peer) {
 }
 
 /// Holds the engine thread before each act until it is let go on, so that what waits is known.
-class Brake : public serve::Observer {
+class Brake : public observe::Observer {
  public:
-  void started(const serve::Received&) override {
+  void started(const observe::Received&) override {
     std::unique_lock lock(mutex_);
     ++n_started_;
     changed_.notify_all();
@@ -138,7 +138,7 @@ class Brake : public serve::Observer {
 /// A server on a free port, with a thread of its own, which a brake may hold.
 class Running {
  public:
-  explicit Running(serve::ServerOptions options = {}, std::vector<serve::Observer*> observers = {},
+  explicit Running(serve::ServerOptions options = {}, std::vector<observe::Observer*> observers = {},
                    Brake* brake = nullptr, serve::SeenSizes* sizes = nullptr)
       : engine(load_engine(kGolden + "/bundle.gguf")), observers_(std::move(observers)), brake_(brake) {
     if (brake_ != nullptr) observers_.push_back(brake_);
@@ -167,7 +167,7 @@ class Running {
   std::unique_ptr<serve::Server> server;
 
  private:
-  std::vector<serve::Observer*> observers_;
+  std::vector<observe::Observer*> observers_;
   Brake* brake_;
   std::thread thread_;
   Status status_;

@@ -17,7 +17,7 @@ struct Held {
   Running running;
   Peer first;
 
-  explicit Held(const serve::ServerOptions& options = {}, const std::vector<serve::Observer*>& observers = {})
+  explicit Held(const serve::ServerOptions& options = {}, const std::vector<observe::Observer*>& observers = {})
       : running(options, observers, &brake), first(running.address()) {
     first.send(act_request(golden(), 1));
     brake.await(1);
@@ -34,9 +34,9 @@ v1::Request health_request() {
 std::uint64_t deadline_ms(std::size_t i) { return 60 + i * 37 % 140; }
 
 /// How many milliseconds after its deadline each late act was answered.
-class Lateness : public serve::Observer {
+class Lateness : public observe::Observer {
  public:
-  void answered(const serve::Answered& answer) override {
+  void answered(const observe::Answered& answer) override {
     if (answer.error == nullptr || answer.error->code != Code::late) return;
     const std::chrono::duration<double, std::milli> took = answer.sent - answer.request.at;
     const std::lock_guard lock(mutex_);
@@ -274,7 +274,7 @@ TEST_CASE("a server that begins to take acts never looks as if it drained") {
   for (int round = 0; round < 2000; ++round) {
     serve::ServerState state;
     std::thread begins([&] { state.begin(); });
-    serve::Health health;
+    observe::Health health;
     while ((health = state.health(exchange)).uptime_s == 0) {
     }
     begins.join();
