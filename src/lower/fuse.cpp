@@ -178,7 +178,7 @@ class Fuser {
     std::int64_t n_key = 0;
     for (std::size_t i = first; i < node.in.size(); i += 2) n_key += node.in[i].dim(2);
     const bool rounds = n_key >= l.target.min_rounded_keys && !comes_from_floats(node.in[0]);
-    AttentionOp op = {&node, prepared(node.in[0]), rounds};
+    AttentionOp op = {.node = &node, .q = prepared(node.in[0]), .rounds = rounds};
     drop(op.q);
     if (has_mask) op.mask = node.in[1].node()->id;
     for (std::size_t i = first; i < node.in.size(); i += 2) {

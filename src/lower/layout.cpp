@@ -47,7 +47,12 @@ ValueId Layouts::add_value(Shape shape, DType type, std::int64_t row) {
 void Layouts::round(const Step& step, LinearOp& op, DType type, std::int64_t row, const char* verb) {
   const auto [known, is_new] = rounded_.try_emplace({op.x, op.norm, type}, kNone);
   if (is_new) {
-    RoundOp made = {op.linears[0], op.x, op.norm, op.norm_weight, op.norm_bias, verb};
+    RoundOp made = {.product = op.linears[0],
+                    .x = op.x,
+                    .norm = op.norm,
+                    .weight = op.norm_weight,
+                    .bias = op.norm_bias,
+                    .verb = verb};
     Step before = {.reads = {}, .writes = {}, .order = step.order};
     meet(before, made.operands());
     known->second = add_value(lowering_.value(made.x).shape, type, row);

@@ -21,8 +21,15 @@ struct Rates {
 };
 // bf16: fitted to 999 products of 50 to 968 rows on an H200, each with float32 results. Codes: of the data sheet, at
 // 0.85 of the tensor units' peak.
-constexpr Rates kBf16 = {38.9e3, 60.8e3, 0.355, 1.2, 1.3, 4.4e-5, 0},
-                kCodes = {0.85 * 32 * 1755, 56e3, 0, 0, 1.5, 4 * 132 / 2.5e6, 2};
+constexpr Rates kBf16 = {
+    .sums = 38.9e3, .of_sm = 60.8e3, .least = 0.355, .kernel = 1.2, .block = 1.3, .end = 4.4e-5, .finish = 0};
+constexpr Rates kCodes = {.sums = 0.85 * 32 * 1755,
+                          .of_sm = 56e3,
+                          .least = 0,
+                          .kernel = 0,
+                          .block = 1.5,
+                          .end = 4 * 132 / 2.5e6,
+                          .finish = 2};
 constexpr double kWritten = 2.5e6;  // bytes that all SMs write to memory in a microsecond
 
 /// A tile of a table, and the bytes that a step of 128 bytes of the depth reads.

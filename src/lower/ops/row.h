@@ -28,7 +28,12 @@ struct RowOp {
 
 template <class Op, class = std::enable_if_t<std::is_constructible_v<decltype(RowOp::what), const Op&>>>
 RowOp lowered(const Lowering& l, const Node& node, const Op& op) {
-  return {&node, op, operand(node, 0), operand(node, 1), operand(node, 2), l.target.norm_needs};
+  return {.node = &node,
+          .what = op,
+          .x = operand(node, 0),
+          .w = operand(node, 1),
+          .b = operand(node, 2),
+          .norm_needs = l.target.norm_needs};
 }
 
 }  // namespace vla::lower

@@ -19,13 +19,18 @@ struct WindowOp {
 };
 
 inline WindowOp lowered(const Lowering&, const Node& node, const op::Unfold& op) {
-  return {&node, op.window, false, operand(node, 0)};
+  return {.node = &node, .window = op.window, .takes_largest = false, .x = operand(node, 0)};
 }
 inline WindowOp lowered(const Lowering&, const Node& node, const op::MaxPool& op) {
-  return {&node, op.window, true, operand(node, 0)};
+  return {.node = &node, .window = op.window, .takes_largest = true, .x = operand(node, 0)};
 }
 inline WindowOp lowered(const Lowering&, const Node& node, const op::Depthwise& op) {
-  return {&node, op.window, false, operand(node, 0), operand(node, 1), operand(node, 2)};
+  return {.node = &node,
+          .window = op.window,
+          .takes_largest = false,
+          .x = operand(node, 0),
+          .weight = operand(node, 1),
+          .bias = operand(node, 2)};
 }
 
 }  // namespace vla::lower
