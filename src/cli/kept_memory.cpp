@@ -14,9 +14,9 @@ constexpr auto kKeptFor = std::chrono::seconds(30);
 
 }  // namespace
 
-void KeptMemory::answered(const serve::Answered& answered) {
+void KeptMemory::answered(const observe::Answered& answered) {
   const std::size_t size = answered.request.size;
-  if (answered.error == nullptr && answered.request.kind == serve::Kind::act && size > kept_ / 2) {
+  if (answered.error == nullptr && answered.request.kind == wire::Kind::act && size > kept_ / 2) {
     last_ = answered.sent;
     if (size > kept_) keep(size);
   }

@@ -10,14 +10,13 @@
 
 namespace vla::door {
 
-/// Counts the frames of HTTP/2 that a peer sends, by their heads alone and before any library looks at them: each kind
-/// has an allowance that fills up again with time, several times what a robot at 60 Hz uses. RFC 9113, sections 4
-/// and 6.
+/// Counts the HTTP/2 frames that a peer sends, by their headers and before any library parses them. Each kind has an
+/// allowance that refills over time: several times what a robot at 60 Hz uses. RFC 9113, sections 4 and 6.
 class Floods {
  public:
-  static constexpr std::uint32_t kMaxHeaderBlock = 16 << 10;  // bytes of HEADERS and its CONTINUATIONs
+  static constexpr std::uint32_t kMaxHeaderBlock = 16 << 10;  // bytes of HEADERS and CONTINUATION frames
 
-  /// The bytes that came next. What there was too much of, in words; null where all is well.
+  /// Counts the bytes that arrived. Returns what exceeds its allowance, in words, or null.
   const char* count(std::span<const std::byte> bytes, Clock::time_point now);
 
  private:
@@ -53,14 +52,14 @@ class Floods {
                                                       {"DATA with nothing in them", 200, 50},
                                                       {"frames of other types", 100, 10}}};
   struct Allowance {
-    double left = -1;  // full before its first use
+    double left = -1;  // full at the start
     Clock::time_point at = {};
   };
 
   const char* count_frame(Clock::time_point now);
   const char* spend(std::size_t kind, Clock::time_point now);
 
-  std::uint64_t to_skip_ = 24;  // the client's preface, then payloads
+  std::uint64_t to_skip_ = 24;  // the client's preface first, then payloads
   std::array<std::uint8_t, 9> head_ = {};
   std::size_t n_head_ = 0;
   std::uint32_t header_block_ = 0;

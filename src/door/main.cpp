@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// vla-door-lerobot: the process that speaks LeRobot's asynchronous inference for `vla serve --lerobot`, which starts
-// it. It reads HTTP/2 and pickles of strangers, and has nothing but their connections and a socket to the server.
+// vla-door-lerobot speaks LeRobot's asynchronous inference in a process of its own, which `vla serve --lerobot` starts.
+// It parses HTTP/2 and pickles from strangers, so it holds nothing but their connections and a socket to the server.
 #include <fmt/format.h>
 #include <malloc.h>
 #include <sys/eventfd.h>
@@ -27,9 +27,9 @@ using serve::lerobot::Robots;
 using Kind = LinkMessage::Kind;
 
 constexpr int kLink = 3, kListener = 4, kFirstOther = 5;
-constexpr std::size_t kReceiptMessages = 4;  // as serve/options.h has it for the other front ends
+constexpr std::size_t kReceiptMessages = 4;  // the same as serve/options.h has for the other front ends
 constexpr std::size_t kOwnMemory = 128u << 20;
-constexpr std::size_t kMaxKept = 1 << 20;  // bytes of a message from the server: a response, a description
+constexpr std::size_t kMaxKept = 1 << 20;  // largest message from the server: a response or a description
 constexpr auto kLastWords = std::chrono::milliseconds(500);
 
 struct Arguments {
@@ -53,13 +53,13 @@ class Door final : Link::Handler, Robots::Server {
     link_.start(*this);
     link_.send(Kind::ready);
   }
-  /// Before every turn of the loop.
+  /// Runs before every turn of the event loop.
   void begin() {
     if (!has_policy_ || is_over_) return;
     rpcs_.begin(robots_);
     sweeper_.turn([this] {
       robots_.sweep();
-      ::malloc_trim(0);  // what a flood took is the system's again
+      ::malloc_trim(0);  // return the memory that a flood took to the system
     });
   }
   bool is_over() const { return is_over_; }
@@ -82,7 +82,7 @@ class Door final : Link::Handler, Robots::Server {
         return;
     }
   }
-  /// The server has ended, or ends.
+  /// The server has ended or is ending.
   void broke(const std::string&) override {
     is_over_ = true;
     robots_.stop();
@@ -92,7 +92,7 @@ class Door final : Link::Handler, Robots::Server {
     v1::Description description;
     if (!description.ParseFromArray(bytes.data(), static_cast<int>(bytes.size()))) return broke("");
     auto names = serve::lerobot::lerobot_names(serve::given_of(map), description);
-    if (!names) return broke("");  // the server has checked it
+    if (!names) return broke("");  // the server has checked these lines
     robots_.serve(std::move(*names), description);
     has_policy_ = true;
   }
@@ -127,12 +127,12 @@ bool read(const char* text, auto& to) {
 }
 
 int run(const Arguments& given) {
-  // A connection has a descriptor here; others are the loop's and the two that were given.
+  // Descriptors: one per connection, those of the event loop, and the two inherited ones.
   confine({kOwnMemory + 16 * given.max_message, given.max_connections + 32}, given.parent, kFirstOther);
   net::Loop loop;
   const int never = ::eventfd(0, EFD_CLOEXEC);
   Door door(loop, given);
-  loop.wait([] {}, never, loop.now());  // opens what it needs while it may
+  loop.wait([] {}, never, loop.now());  // opens its descriptors before the sandbox forbids it
   if (const std::string missing = confine_calls(); !missing.empty())
     std::fprintf(stderr, "vla-door-lerobot: %s\n", missing.c_str());
   door.start();

@@ -31,18 +31,19 @@ using serve::lerobot::Peer;
 using serve::lerobot::Rpc;
 
 constexpr std::size_t kReadAtOnce = 256 << 10, kWriteAtOnce = 256 << 10;
-constexpr std::size_t kCallCost = 4 << 10;        // bytes that a call counts for before any of it came
-constexpr std::uint32_t kMaxFrame = 1 << 20;      // frames of cameras come in few pieces
-constexpr std::int32_t kWindow = 16 << 20;        // of a call and of a connection: bytes are counted here
-constexpr std::size_t kMaxOutbound = 1000;        // frames that wait for a peer that does not read
-constexpr std::size_t kMaxHeaderList = 16 << 10;  // bytes of a call's headers, decompressed
+constexpr std::size_t kCallCost = 4 << 10;    // bytes that a call counts for before any data arrives
+constexpr std::uint32_t kMaxFrame = 1 << 20;  // large, so that camera frames arrive in few pieces
+// HTTP/2 windows of a stream and a connection; bytes are limited here instead
+constexpr std::int32_t kWindow = 16 << 20;
+constexpr std::size_t kMaxOutbound = 1000;        // queued frames for a peer that does not read
+constexpr std::size_t kMaxHeaderList = 16 << 10;  // decompressed header bytes per call
 constexpr std::size_t kMaxWords = 2000;           // of an error
-// In seconds of this process: for the first call, for a sign of life, before a ping asks for one, for a peer that does
+// Timeouts in seconds: until the first call; without a sign of life; before a ping asks for one; for a peer that does
 // not read.
 constexpr int kHandshakePatience = 10, kSilencePatience = 60, kPingAfter = 20, kStallPatience = 10;
 constexpr auto kReceiptPatience = std::chrono::seconds(60);
 
-/// gRPC's numbers of its statuses.
+/// gRPC status codes.
 int status_of(Code code) {
   switch (code) {
     case Code::bad_request:
@@ -88,7 +89,7 @@ nghttp2_nv header(std::string_view name, std::string_view value) {
 
 class Connection;
 
-/// A call, from its headers until its stream is closed.
+/// A call, from its headers until its stream closes.
 struct Call {
   Connection& connection;
   std::int32_t stream = 0;
@@ -96,8 +97,8 @@ struct Call {
   Clock::time_point began = {};
   std::string method = {}, content_type = {};
   std::size_t header_bytes = 0;
-  std::string framed = {};   // gRPC's frame that is not whole yet
-  std::string message = {};  // what came whole
+  std::string framed = {};   // a partial gRPC message
+  std::string message = {};  // the complete messages
   bool has_message = false;
   std::size_t n_held = 0;
   bool is_whole = false, is_handed_over = false, is_answered = false, has_ended = false;
@@ -107,8 +108,8 @@ struct Call {
 
 struct Shared : net::Connections<Connection> {
   Rpcs::Handler* handler = nullptr;
-  std::vector<std::uint8_t> in = std::vector<std::uint8_t>(kReadAtOnce);  // of whichever connection reads
-  std::map<std::uint64_t, Call*> calls = {};                              // that are not answered
+  std::vector<std::uint8_t> in = std::vector<std::uint8_t>(kReadAtOnce);  // of the connection that is being read
+  std::map<std::uint64_t, Call*> calls = {};                              // not answered yet
   std::uint64_t n_id = 0;
   std::size_t n_call = 0;
   bool is_stopping = false, is_handling = false;
@@ -118,7 +119,7 @@ struct Shared : net::Connections<Connection> {
   void handle_later();
   void handle_next();
 
-  /// Calls that came whole are handled one after the other, by turns of the groups.
+  /// Complete calls are handled one after the other, in turn by group of peers.
   std::list<std::pair<std::string, std::deque<Rpc>>> turns = {};
 };
 
@@ -201,7 +202,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     });
   }
 
-  // Called by the library, of whose functions none may throw through it.
+  // Callbacks of the library. None may throw through it.
   template <class Step>
   static int called(void* connection, Step step) {
     auto& self = *static_cast<Connection*>(connection);
@@ -231,7 +232,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   }
 
  private:
-  /// No memory on the way costs this connection only.
+  /// Running out of memory here ends this connection only.
   template <class Step>
   void guard(Step step) noexcept {
     const auto self = shared_from_this();
@@ -240,7 +241,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     } catch (const std::exception& exception) {
       try {
         drop("memory", exception.what());
-      } catch (const std::exception&) {  // it is closed, and nobody was told
+      } catch (const std::exception&) {  // closed before the handler was told of it
       }
     }
   }
@@ -314,7 +315,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     const auto found = calls_.find(stream);
     return found == calls_.end() ? nullptr : found->second.get();
   }
-  /// Takes a call out of those that are to be answered.
+  /// Removes a call from those that wait for an answer.
   bool take(Call& call) {
     if (std::exchange(call.is_answered, true)) return false;
     shared_.calls.erase(call.id);
@@ -340,7 +341,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     for (const auto& [stream, call] : calls_)
       if (!call->is_whole && !call->is_answered && shared_.loop.now() - call->began > kReceiptPatience)
         late.push_back(stream);
-    for (const std::int32_t stream : late)  // a refusal that is sent may end other calls
+    for (const std::int32_t stream : late)  // sending a refusal may end other calls
       if (Call* const call = find(stream)) refuse(*call, {Code::late, "call", "a whole message within 60 s", "a part"});
   }
   void take_frames(Call& call);
@@ -357,9 +358,10 @@ class Connection : public std::enable_shared_from_this<Connection> {
   std::string out_;
   std::size_t n_held_ = 0;
   Clock::time_point served_ = {}, began_ = {};
-  int age_ = 0, silent_ = 0, stalled_ = 0;  // sweeps: since it came, since a sign of life, since it took our bytes
+  // sweeps since it connected, since the last sign of life, since it last read our bytes
+  int age_ = 0, silent_ = 0, stalled_ = 0;
   bool is_open_ = false, is_closed_ = false, is_writing_ = false;
-  // The library calls us, and may not be called to send meanwhile: the end of one call can answer another one.
+  // Inside a callback nothing may be sent: the end of one call may answer another one.
   bool is_in_library_ = false;
 };
 
@@ -401,7 +403,7 @@ void Connection::take_data(std::int32_t stream, std::string_view data) {
   take_frames(*call);
 }
 
-/// Messages of gRPC: a byte, whether it is compressed, the length, and so many bytes.
+/// A gRPC message: one byte for compression, the length, then the data.
 void Connection::take_frames(Call& call) {
   while (call.framed.size() >= 5 && !call.is_whole && !call.is_answered) {
     const auto* head = reinterpret_cast<const unsigned char*>(call.framed.data());
@@ -458,8 +460,8 @@ void Connection::hand_over(Call& call) {
   shared_.hand_over(call, {call.id, peer_, call.method, std::move(call.message)});
 }
 
-/// Connections end while there are too many calls: of the group that has most, the one whose calls began first. All
-/// groups are alike that have no more calls than one connection may.
+/// While there are too many calls, ends connections: in the group with the most calls, the one whose calls began first.
+/// Groups with no more calls than one connection may have count as equal.
 void Shared::bound_calls() {
   const std::size_t most = limits.connections;
   while (n_call > most) {
@@ -479,14 +481,14 @@ void Shared::hand_over(Call& call, Rpc rpc) {
   handle_later();
 }
 
-/// Between two of them every socket has its turn.
+/// Handles one call at a time, so that every socket gets its turn in between.
 void Shared::handle_later() {
   if (turns.empty() || std::exchange(is_handling, true)) return;
   asio::post(loop.context(), [this] {
     is_handling = false;
     try {
       handle_next();
-    } catch (const std::exception&) {  // no memory for an answer: the client's patience ends its call
+    } catch (const std::exception&) {  // no memory for an answer; the client times out
     }
     handle_later();
   });
@@ -579,7 +581,7 @@ class Rpcs::All : public Shared {
     ::getsockname(descriptor, reinterpret_cast<sockaddr*>(&address), &size);
     return address.ss_family == AF_INET6 ? tcp::v6() : tcp::v4();
   }
-  /// An IPv4 address that came to a socket of IPv6 is one of IPv4.
+  /// Treats an IPv4 address that is mapped into IPv6 as IPv4.
   static std::string address_of(const tcp::endpoint& endpoint) {
     const asio::ip::address address = endpoint.address();
     if (!address.is_v6() || !address.to_v6().is_v4_mapped()) return address.to_string();

@@ -23,7 +23,7 @@ namespace vla::door {
 namespace {
 
 #if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-constexpr bool kIsWatched = true;  // a sanitizer takes terabytes of addresses, and calls of its own
+constexpr bool kIsWatched = true;  // a sanitizer reserves terabytes of addresses and makes system calls of its own
 #elif defined(__has_feature)
 constexpr bool kIsWatched = __has_feature(address_sanitizer) || __has_feature(thread_sanitizer);
 #else
@@ -56,7 +56,7 @@ constexpr std::uint32_t kArchitecture = AUDIT_ARCH_AARCH64;
 constexpr std::uint32_t kArchitecture = 0;
 #endif
 
-/// Sockets, timers, memory, and what a process needs to end.
+/// System calls for sockets, timers, memory and the end of the process.
 constexpr long kAllowed[] = {
     SYS_read,
     SYS_write,
@@ -107,7 +107,7 @@ constexpr long kAllowed[] = {
     SYS_time,
 #endif
 };
-/// Allowed where the memory is not to be executed: the argument 2.
+/// Allowed unless argument 2 asks for executable memory.
 constexpr long kMapping[] = {SYS_mmap, SYS_mprotect};
 
 sock_filter statement(unsigned code, std::size_t k) {
@@ -117,7 +117,7 @@ sock_filter jump(unsigned code, std::size_t k, std::uint8_t yes, std::uint8_t no
   return {static_cast<std::uint16_t>(code), yes, no, static_cast<std::uint32_t>(k)};
 }
 
-/// A refused call fails with EPERM; one of another architecture ends the process.
+/// A forbidden call fails with EPERM; a call of another architecture kills the process.
 std::vector<sock_filter> make_filter() {
   std::vector<sock_filter> filter = {
       statement(BPF_LD | BPF_W | BPF_ABS, offsetof(seccomp_data, arch)),
@@ -144,8 +144,9 @@ std::vector<sock_filter> make_filter() {
 
 void confine(const Limits& limits, int parent, int n_kept) {
   ::prctl(PR_SET_PDEATHSIG, SIGKILL);
-  if (::getppid() != parent) std::_Exit(0);  // it had ended before
-  // The server ends it, by the end of its socket: it still has to tell its clients.
+  if (::getppid() != parent) std::_Exit(0);  // the parent had ended before
+  // Ignores signals that the terminal sends to both: the server ends this process by closing its socket, so that it can
+  // still tell its clients.
   for (const int signal : {SIGINT, SIGTERM, SIGHUP, SIGPIPE}) ::signal(signal, SIG_IGN);
   close_others(n_kept);
   ::prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0);
@@ -153,7 +154,7 @@ void confine(const Limits& limits, int parent, int n_kept) {
   limit(RLIMIT_CORE, 0);
   if (kIsWatched) return;
   limit(RLIMIT_DATA, limits.memory);
-  limit(RLIMIT_AS, limits.memory + (512u << 20));  // with its libraries
+  limit(RLIMIT_AS, limits.memory + (512u << 20));  // including its libraries
 }
 
 std::string confine_calls() {

@@ -7,15 +7,15 @@
 
 namespace vla::door {
 
-/// What a process may take that reads what strangers send.
+/// Limits of a process that reads data from strangers.
 struct Limits {
   std::size_t memory = 0;       // bytes
   std::size_t descriptors = 0;  // at once
 };
 
-/// Ends with the process `parent`, keeps no descriptors but the first `n_kept`, and has these limits from now on.
+/// Applies the limits: this process ends with `parent`, and closes all descriptors but the first `n_kept`.
 void confine(const Limits& limits, int parent, int n_kept);
-/// Allows only the system calls that serve sockets and memory. Returns what is missing of that; empty if nothing is.
+/// Allows only the system calls for sockets and memory. Returns which protection is missing on this system, or "".
 std::string confine_calls();
 
 }  // namespace vla::door

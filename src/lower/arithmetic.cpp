@@ -12,7 +12,7 @@ namespace {
 
 constexpr const char *kFloat32 = "float32", *kBf16 = "bf16", *kInt8 = "int8", *kInt4 = "int4";
 
-/// The kernels of a set, as far as the machine has what they use. Errors: device.
+/// Selects a kernel set, limited to the features that the machine has. Errors: device.
 Result<Arithmetic> with(const KernelSet& set, Features machine) {
   if (machine.has_all(set.needs))
     return Arithmetic{set == kernel_set::ggml ? Arithmetic::Backend::ggml : Arithmetic::Backend::own,
@@ -23,7 +23,7 @@ Result<Arithmetic> with(const KernelSet& set, Features machine) {
                "leave the choice to the program"};
 }
 
-/// The best of the machine, with large matrices of this dtype.
+/// Returns the machine's best kernels, with large matrices converted to this dtype at load.
 Arithmetic rounding(Rounding at_load, Arithmetic best) {
   best.at_load = at_load;
   return best;

@@ -8,21 +8,22 @@
 
 namespace vla {
 
-/// The backend that computes products, and its precision: the meaning of `--kernels`, which nothing else reads.
+/// The backend and precision of products. Parses `--kernels`.
 struct Arithmetic {
   enum class Backend { own, ggml };
 
   Backend backend = Backend::own;
-  Features use;  // of our own kernels
+  Features use;  // features that our own kernels may use
   Rounding at_load = Rounding::none;
 
-  /// On a processor: a KernelSet by name, "float32" for the best that rounds nothing, "bf16" for the best that rounds
-  /// to bf16, large matrices too, "int8" or "int4" for the best with large matrices quantized, or nothing for the best.
-  /// Errors: usage for an unknown name, device for one that the processor cannot run.
+  /// Parses `--kernels` for a CPU: the name of a KernelSet; "float32" for the fastest kernels that round nothing;
+  /// "bf16" for the fastest kernels, with large matrices rounded to bf16; "int8" or "int4" for the fastest kernels,
+  /// with large matrices quantized; empty for the fastest. Errors: usage for an unknown name, device for kernels that
+  /// the processor cannot run.
   static Result<Arithmetic> on_cpu(const std::string& kernels, Features machine);
-  /// On a device of another kind. On CUDA our own kernels compute, with matrices as they are stored or, as on the CPU,
-  /// with "float32", "bf16" or "int8"; "ggml" is ggml's backend in float32. Vulkan has ggml's alone: "float32", "ggml"
-  /// or nothing, or "bf16". Errors: usage.
+  /// Parses `--kernels` for another device. CUDA runs our own kernels on matrices as stored (empty) or converted
+  /// ("float32", "bf16", "int8"); "ggml" selects ggml's backend in float32. Vulkan has only ggml's: "float32", "ggml",
+  /// "bf16" or empty. Errors: usage.
   static Result<Arithmetic> on_device(const std::string& kernels, const std::string& device);
 };
 

@@ -20,7 +20,7 @@ class Fuser {
       if (l.needed[at(&node)] && !l.fused[at(&node)]) visit(node);
     join_products();
     fuse_readings();
-    // A norm or a window that its readers compute is no operation.
+    // A norm or a window that its readers compute makes no operation of its own.
     std::erase_if(ops_, [&](const FusedOp& op) {
       const auto* row = std::get_if<RowOp>(&op.op);
       const auto* window = std::get_if<WindowOp>(&op.op);
@@ -43,7 +43,7 @@ class Fuser {
     std::visit([&](const auto& op) { visit(node, op); }, node.op);
   }
 
-  // Leaves are values; what a slot gets is the result of another operation (store.cpp).
+  // Leaves are values, not operations; writes to slots are handled in store.cpp.
   void visit(const Node&, const op::Input&) {}
   void visit(const Node&, const op::Constant&) {}
   void visit(const Node&, const op::Parameter&) {}
@@ -56,7 +56,7 @@ class Fuser {
     if (l.value(node.id).base == node.id) add(lowered(l, node, op), node);  // else it is a view
   }
 
-  /// The only node that reads this one, if there is exactly one and no tap, unless it is part of something already.
+  /// Returns the only reader of a node, or null if it has several, is tapped, or the reader was fused already.
   const Node* only_reader(const Node& node) const {
     if (node.tapped || l.readers[at(&node)].size() != 1) return nullptr;
     const Node* reader = l.readers[at(&node)][0];
@@ -98,13 +98,13 @@ class Fuser {
     return node;
   }
 
-  /// [d] of elements that follow each other, for every row of a result.
+  /// Whether a tensor is [d], contiguous, and applies to every row of a result.
   bool is_vector(Tensor factor, const Node& result) const {
     return factor.dim(0) == result.shape[0] && count(factor.shape()) == factor.dim(0) &&
            l.value(factor.node()->id).stride[0] == 1;
   }
 
-  /// activation(gate) * up, where `linear` is one of the two and the other has the same x.
+  /// Matches activation(gate) * up, where `linear` is one of the two products and both read the same x.
   const Node* fuse_gate(const Node& linear, LinearOp& op) {
     const Node* next = only_reader(linear);
     const Node* activate = next != nullptr && next->as<op::Activate>() != nullptr ? next : nullptr;
@@ -113,7 +113,7 @@ class Fuser {
     const Node* self = activate != nullptr ? activate : &linear;
     const Node* other = product->in[product->in[0].node() == self ? 1 : 0].node();
     const Node *gate = &linear, *up = other;
-    if (activate == nullptr) {  // then the other side must be the activated one
+    if (activate == nullptr) {  // then the other factor must be the activated one
       if (other->as<op::Activate>() == nullptr || only_reader(*other) != product) return nullptr;
       activate = other, gate = other->in[0].node(), up = &linear;
       if (gate->as<op::Linear>() == nullptr || only_reader(*gate) != activate) return nullptr;
@@ -126,7 +126,7 @@ class Fuser {
     return take(product);
   }
 
-  /// A norm or a rotation of heads that only this attention reads is done while it copies the rows.
+  /// Matches a norm or rotation of heads that only this attention reads; attention applies it as it copies the rows.
   HeadRows prepared(Tensor x) {
     HeadRows result = {x.node()->id};
     const auto is_only = [&](const Node* node) { return !node->tapped && l.readers[at(node)].size() == 1; };
@@ -144,7 +144,8 @@ class Fuser {
     return result;
   }
 
-  /// Rows of norms and rotations were visited before the attention that takes them.
+  /// Marks the norm and rotation that attention applies as fused; their operations were made before and are dropped
+  /// at the end.
   void drop(const HeadRows& rows) {
     for (const Node* node : {rows.norm, rows.rope})
       if (node != nullptr) l.fused[at(node)] = true;
@@ -163,7 +164,7 @@ class Fuser {
     return known->second = id;
   }
 
-  /// Whether a matrix made it that is float32 or float16 in memory.
+  /// Whether x comes from a product with a matrix that is float32 or float16 in memory.
   bool comes_from_floats(Tensor x) const {
     const Node* node = x.node();
     while (node->as<op::Linear>() == nullptr && !node->in.empty()) node = node->in[0].node();
@@ -188,7 +189,7 @@ class Fuser {
     add(std::move(op), node);
   }
 
-  /// Products of one x that nothing follows share the reading of it.
+  /// Joins products of one x into one operation, which reads x once, if nothing is fused behind them.
   void join_products() {
     std::map<std::pair<ValueId, const void*>, FusedOp*> open;
     for (FusedOp& op : ops_) {
@@ -208,8 +209,8 @@ class Fuser {
     std::erase_if(ops_, [](const FusedOp& op) { return op.writes.empty(); });
   }
 
-  /// Fuses a norm or a window into the products that alone read it: they compute it as they copy x, row by row or
-  /// place by place.
+  /// Fuses a norm or a window into the products that read it, if nothing else does: they compute it as they copy x, row
+  /// by row or place by place.
   void fuse_readings() {
     for (FusedOp& op : ops_) {
       auto* linear = std::get_if<LinearOp>(&op.op);

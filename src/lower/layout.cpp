@@ -6,7 +6,7 @@ namespace vla::lower {
 
 namespace {
 
-/// The most that a value fits.
+/// Returns the strictest need that a value meets.
 Needs fit_of(const Value& value) {
   if (is_contiguous(value)) return Needs::contiguous;
   if (row_stride(value) >= 0) return Needs::even_rows;
@@ -24,7 +24,7 @@ void Layouts::meet(Step& step, const Operands& operands) {
   }
 }
 
-/// A contiguous copy of a value.
+/// Adds a contiguous copy of a value.
 ValueId Layouts::copied(ValueId id, int order) {
   const Value from = lowering_.value(id);
   const ValueId copy = add_value(from.shape, from.type, from.shape[0]);

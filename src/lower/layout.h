@@ -9,8 +9,7 @@
 
 namespace vla::lower {
 
-/// How operands come to lie as operations need them. A target derives from it what it does to products, attention and
-/// packing beside that.
+/// Makes operands meet their operations' needs. A target derives its own class for products, attention and packing.
 class Layouts {
  public:
   virtual ~Layouts() = default;
@@ -18,14 +17,15 @@ class Layouts {
  protected:
   explicit Layouts(Lowering& lowering) : lowering_(lowering) {}
 
-  /// Copies the operands that do not lie as the step needs them, and notes them all as what it reads.
+  /// Copies the operands that do not meet their needs, and records all as the step's reads.
   void meet(Step& step, const Operands& operands);
-  /// A value that the target makes on the way; `row`: elements from one row to the next.
+  /// Adds a value that the target makes. `row`: elements from one row to the next.
   ValueId add_value(Shape shape, DType type, std::int64_t row);
-  /// Has a product read x, or its norm, in another type, made just before the first that does.
+  /// Makes a product read x, or its norm, in another type. The first product that asks adds the conversion; later ones
+  /// share it.
   void round(const Step& step, LinearOp& op, DType type, std::int64_t row, const char* verb);
 
-  /// Adds an operation that comes before the one at hand.
+  /// Adds an operation before the current one.
   virtual void add(Step step, CopyOp copy) = 0;
   virtual void add(Step step, RoundOp round) = 0;
 
@@ -33,7 +33,7 @@ class Layouts {
   ValueId copied(ValueId id, int order);
 
   Lowering& lowering_;
-  std::map<std::tuple<ValueId, const Node*, DType>, ValueId> rounded_;  // of x, or of its norm
+  std::map<std::tuple<ValueId, const Node*, DType>, ValueId> rounded_;  // converted x, or its norm
 };
 
 }  // namespace vla::lower

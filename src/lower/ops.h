@@ -14,8 +14,8 @@
 #include "lower/ops/row.h"
 #include "lower/ops/window.h"
 
-/// The operations that every target runs: a file of lower/ops says what each is and needs, one of lower/cpu/ops and
-/// one of lower/cuda/ops how a target runs it.
+/// The operations that every target runs. A file of lower/ops declares each with its needs; a file of lower/cpu/ops and
+/// one of lower/cuda/ops say how a target runs it.
 #define VLA_LOWERED_OPS(OP) \
   OP(LinearOp) OP(RoundOp) OP(AttentionOp) OP(RowOp) OP(CopyOp) OP(LookupOp) OP(WindowOp) OP(ChannelOp)
 
@@ -23,9 +23,9 @@ namespace vla::lower {
 
 template <class Op>
 concept LoweredOp = requires(Op op, const Op& same) {
-  { op.operands() } -> std::same_as<Operands>;   // which values it reads, and how they must lie
-  { same.text() } -> std::same_as<std::string>;  // what it computes, as a printed program says it
-  { same.flop() } -> std::same_as<double>;       // operations of its products, two for each multiply-add
+  { op.operands() } -> std::same_as<Operands>;   // the values it reads, and their layout needs
+  { same.text() } -> std::same_as<std::string>;  // its text in a printed program
+  { same.flop() } -> std::same_as<double>;       // FLOP of its products, two per multiply-add
 };
 #define VLA_CHECK_OP(Op) static_assert(LoweredOp<Op>, #Op " says operands(), text() and flop() in lower/ops");
 VLA_LOWERED_OPS(VLA_CHECK_OP)
@@ -37,20 +37,21 @@ struct OpList {
   using With = std::variant<Ops..., More...>;
 };
 #define VLA_NEXT_OP(Op) , Op
-/// Those, and operations that a target has beside them.
+/// These operations, and those that a target adds.
 template <class... More>
 using AnyOp = typename OpList<void VLA_LOWERED_OPS(VLA_NEXT_OP)>::template With<More...>;
 #undef VLA_NEXT_OP
 
-/// One operation of the program: nodes that were fused.
+/// One operation of the program, made of one or several nodes.
 struct FusedOp : Step {
   AnyOp<PackOp> op;
 };
 
-/// Makes operations of nodes: norm into product; bias, activation, gate, factor and residual behind it; products of
-/// one x; gate and up; norm and rope into attention. A tapped node is computed for itself.
+/// Fuses nodes into operations: norm into the product that follows; bias, activation, gate, factor and residual into
+/// the product before; products of one x; gate and up; norm and rope into attention. A tapped node is computed on its
+/// own.
 std::vector<FusedOp> fuse(Lowering& l);
-/// Has results that slots get written there at once, or copied.
+/// Has results written straight to their slots, or copies them there.
 void store(Lowering& l, std::vector<FusedOp>& ops);
 
 }  // namespace vla::lower

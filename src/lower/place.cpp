@@ -8,7 +8,7 @@
 namespace vla::lower {
 namespace {
 
-/// The phases in which a value must stand in memory.
+/// The phases during which a value must stay in memory.
 struct Lifetime {
   int first = 0, last = -1;
   bool overlaps(const Lifetime& other) const { return first <= other.last && other.first <= last; }
@@ -29,8 +29,8 @@ std::vector<Lifetime> find_lifetimes(const Lowering& l, const std::vector<Step*>
 
 }  // namespace
 
-/// Values one after the other, largest first, each at the lowest place that no other value takes while it lives.
-/// Constants lie behind what is kept.
+/// Places values, largest first, each at the lowest offset that is free throughout its lifetime. Constants follow the
+/// kept values.
 void place(Lowering& l, const std::vector<Step*>& steps) {
   const std::vector<Lifetime> lifetimes = find_lifetimes(l, steps);
   std::vector<std::size_t> order(l.values.size());
@@ -41,14 +41,14 @@ void place(Lowering& l, const std::vector<Step*>& steps) {
     Lifetime lifetime;
     std::size_t begin, end;
   };
-  std::vector<Taken> taken;  // by where they begin
+  std::vector<Taken> taken;  // sorted by begin
   for (const std::size_t i : order) {
     Value& value = l.values[i];
     const Lifetime& lifetime = lifetimes[i];
     if (value.placement != Value::Placement::arena || value.base != static_cast<ValueId>(i) || lifetime.last < 0)
       continue;
     const std::size_t size = l.target.aligned(value.size);
-    if (lifetime.first < l.n_prepare && lifetime.last >= l.n_prepare) {  // made by prepare, for every run
+    if (lifetime.first < l.n_prepare && lifetime.last >= l.n_prepare) {  // prepare computes it, runs read it
       value.placement = Value::Placement::kept;
       value.begin = l.kept_size;
       l.kept_size += size;

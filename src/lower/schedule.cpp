@@ -8,7 +8,7 @@
 namespace vla::lower {
 namespace {
 
-/// Marks the steps that compute from slots that do not vary: their results stay the same.
+/// Marks steps that depend on no varying slot as invariant.
 void find_invariants(const Lowering& l, const std::vector<Step*>& steps) {
   const auto& varying = l.options.varying;
   std::vector<bool> varies(l.values.size(), false);
@@ -31,8 +31,8 @@ struct SlotUse {
   int read = -1, written = -1;
 };
 
-/// The first phase behind all that an operation needs, and behind those who read or write a slot before it does. Stages
-/// follow each other.
+/// Gives each step the first phase after its operands are made, and after earlier accesses to the slots that it reads
+/// or writes. Stages follow each other.
 int schedule_part(Lowering& l, const std::vector<Step*>& steps, bool invariant, int first) {
   std::map<const Slot*, SlotUse> slots;
   const auto use_of = [&](ValueId id) -> SlotUse* {

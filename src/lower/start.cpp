@@ -31,7 +31,7 @@ std::vector<float> contiguous(const float* data, const Shape& shape, const Shape
 
 std::int64_t row_stride(const Value& value) {
   if (value.shape[0] != 1 && value.stride[0] != 1) return -1;
-  std::int64_t row = value.shape[0], n = 0;  // rows seen so far
+  std::int64_t row = value.shape[0], n = 0;  // rows so far
   for (std::size_t i = 1; i < 4; ++i) {
     if (value.shape[i] == 1) continue;
     if (n == 0)
@@ -51,10 +51,10 @@ const void* constant_of(const Value& value) {
 
 namespace {
 
-/// Strides of the same elements in another shape, where that takes no copy: every dimension of the one must be cut from
-/// dimensions of the other that follow each other in memory.
+/// Returns the strides of a reshaped view if no copy is needed: each new dimension must be cut from old dimensions that
+/// are contiguous with each other.
 std::optional<Shape> reshape_strides(const Value& value, const Shape& to) {
-  std::vector<std::int64_t> sizes, strides;  // of the old shape, dimensions joined where they follow each other
+  std::vector<std::int64_t> sizes, strides;  // of the old shape, with contiguous dimensions joined
   for (std::size_t i = 0; i < 4; ++i) {
     if (value.shape[i] == 1) continue;
     if (!sizes.empty() && value.stride[i] == strides.back() * sizes.back())
@@ -64,7 +64,7 @@ std::optional<Shape> reshape_strides(const Value& value, const Shape& to) {
   }
   Shape result = contiguous_strides(to);
   std::size_t at = 0;
-  std::int64_t taken = 1;  // of the old dimension
+  std::int64_t taken = 1;  // of the current old dimension
   for (std::size_t i = 0; i < 4; ++i) {
     if (to[i] == 1) continue;
     if (at == sizes.size() || sizes[at] % (taken * to[i]) != 0) return {};
@@ -89,7 +89,7 @@ Value view(const Node& node, const Value& of, const Shape& stride, std::int64_t 
   return value;
 }
 
-/// A view where the operation computes nothing, else a value of its own.
+/// Makes a view if the node computes nothing, else a value of its own.
 struct MakeValue {
   const Lowering& l;
   const Node& node;
@@ -122,7 +122,7 @@ struct MakeValue {
     return must_copy() || !stride ? own(node) : view(node, x(), *stride, 0);
   }
 
-  /// Whatever else there is computes.
+  /// All other nodes compute something.
   template <class Computes>
   Value operator()(const Computes&) const {
     return own(node);
@@ -130,7 +130,7 @@ struct MakeValue {
 
  private:
   const Value& x() const { return l.value(node.in[0].node()->id); }
-  /// Whether a tap records a copy, since the value is in a slot, which may be overwritten later in the run.
+  /// Whether a tapped view must be a copy: its slot may be overwritten later in the run.
   bool must_copy() const { return node.tapped && l.base(x().base).placement == Value::Placement::slot; }
   Value in_slot(const Slot& slot) const {
     Value value = own(node);

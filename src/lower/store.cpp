@@ -7,8 +7,8 @@
 namespace vla::lower {
 namespace {
 
-/// Nobody may need what the slot held once it is overwritten. An operation row by row may read it itself, every
-/// element before it writes that.
+/// Whether `result` may be written straight to the slot of `write`. True if no later operation reads the slot; a
+/// row-wise operation may read it itself, since it reads each element before it writes it.
 bool may_write(const Lowering& l, const std::vector<FusedOp>& ops, const Node& write, ValueId result) {
   const Slot* slot = l.value(write.id).slot;
   const auto writer = std::find_if(ops.begin(), ops.end(), [&](const FusedOp& op) {
@@ -28,7 +28,7 @@ bool may_write(const Lowering& l, const std::vector<FusedOp>& ops, const Node& w
   return true;
 }
 
-/// A value goes to its slot at once where its operation may write there, else by a copy.
+/// Writes a value straight to its slot if that is safe, else adds a copy.
 void store(Lowering& l, std::vector<FusedOp>& ops, const Node& write) {
   const ValueId from = write.in[0].node()->id;
   Value& value = l.value(from);

@@ -8,7 +8,7 @@
 namespace vla::lower {
 namespace {
 
-/// The type, shape and place of a value.
+/// Prints the type, shape and placement of a value.
 std::string layout(const Lowering& l, ValueId id) {
   const Value& value = l.value(id);
   const Value::Placement placement = l.base(id).placement;

@@ -9,11 +9,12 @@
 namespace vla::lower {
 namespace {
 
-/// Each block reads all weights: of fewer rows they would not come as fast as they are multiplied.
+/// Fewest rows of a block. Each block reads all weights; with fewer rows, reading them would take longer than
+/// multiplying.
 constexpr std::int64_t kMinBlockRows = 128;
 
-/// How many blocks of rows keep `x` in the L2 cache from the product that makes it to the one that reads it; 0
-/// where it stays there without blocks, or would not with blocks that pay.
+/// Returns how many blocks of rows keep `x` in the L2 cache between the product that writes it and the one that reads
+/// it; 0 if x fits without blocks, or if the blocks would have too few rows.
 std::int64_t n_block_of(const CpuLowering& l, const Value& x, const kernels::LinearKernel& reader) {
   if (rounded(x) != kernels::RoundedLayout::tiles) return 0;
   const std::int64_t d = kernels::round_up(x.shape[0], kernels::kTileSide), n_row = count(x.shape) / x.shape[0];
@@ -23,7 +24,7 @@ std::int64_t n_block_of(const CpuLowering& l, const Value& x, const kernels::Lin
   return n_row / n_block >= kMinBlockRows ? n_block : 0;
 }
 
-/// The operations that read each base.
+/// Lists the operations that read each base.
 std::map<ValueId, std::vector<CpuOp*>> readers_of(CpuLowering& l) {
   std::map<ValueId, std::vector<CpuOp*>> readers;
   for (CpuOp& op : l.ops)
@@ -31,7 +32,7 @@ std::map<ValueId, std::vector<CpuOp*>> readers_of(CpuLowering& l) {
   return readers;
 }
 
-/// `up` becomes part of `down`, which alone reads what it makes, and is left without results.
+/// Moves product `up` into the blocks of `down`, the only reader of its result, and leaves `up` without results.
 void join(CpuLowering& l, CpuOp& up, CpuOp& down, std::int64_t n_block) {
   const ValueId inner = up.writes[0];
   l.value(inner).placement = Value::Placement::thread;

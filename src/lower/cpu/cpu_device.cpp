@@ -17,7 +17,7 @@
 namespace vla::lower {
 namespace {
 
-/// More keys than attention can have: none of it rounds.
+/// More keys than attention can have, so that attention never rounds.
 constexpr std::int64_t kNoKeys = std::numeric_limits<std::int64_t>::max();
 
 Multiplier multiplier_of(const CpuWeights& weights, const Param& matrix) {
@@ -25,7 +25,7 @@ Multiplier multiplier_of(const CpuWeights& weights, const Param& matrix) {
   return {&kernel, kernel.max_norm, kernel.takes_windows, kernel.takes_windows, &weights.encoding(&matrix)};
 }
 
-/// Kernels of attention have room for so much.
+/// The widest head for which the attention kernels have room.
 Status check_attention(const Graph& graph) {
   for (const Node& node : graph.nodes()) {
     const auto* attention = node.as<op::Attention>();
@@ -97,7 +97,7 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
   choose_blocks(l);
   arrange(l, l.ops);
   if (l.arena_size > arena_.size()) {
-    // Programs made before keep the memory that they were given.
+    // Programs that exist keep the arena that they were given.
     VLA_TRY(arena_, Memory::allocate(l.arena_size, "working memory"));
   }
   return CpuProgram::make(l, arena_, executor_, clock_);

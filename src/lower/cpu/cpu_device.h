@@ -10,7 +10,7 @@
 
 namespace vla::lower {
 
-/// This machine's cores, with kernels of our own.
+/// Runs graphs on this machine's cores with our own kernels.
 class CpuDevice final : public Device {
  public:
   /// Errors: device.
@@ -49,7 +49,7 @@ class CpuDevice final : public Device {
   std::shared_ptr<kernels::Executor> executor_;
   std::shared_ptr<kernels::KindClock> clock_ = std::make_shared<kernels::KindClock>();
   CpuWeights weights_;
-  Memory arena_;  // of values that live within a run: programs share it, since one runs at a time
+  Memory arena_;  // values that live within a run; all programs share it, since one runs at a time
 };
 
 }  // namespace vla::lower

@@ -11,7 +11,7 @@
 namespace vla::lower {
 namespace {
 
-/// Bytes of host memory for a task, estimated: the largest one, and what lists and allocator keep for it.
+/// Estimated bytes of host memory per task: the largest task, list entries and allocator overhead.
 constexpr std::size_t kTaskSize = sizeof(kernels::LinearJob) + 2 * sizeof(void*) + 256;
 
 }  // namespace
@@ -64,7 +64,7 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
   std::vector<std::string> likeness(phases_.size());
   counted_.resize(phases_.size());
   work_.resize(stages.size() + 1);
-  std::vector<std::size_t> stage_end(stages.size(), 0);  // the last phase of each, and one
+  std::vector<std::size_t> stage_end(stages.size(), 0);  // one past the last phase of each stage
   for (const CpuOp& op : l.ops) {
     const auto phase = static_cast<std::size_t>(op.phase);
     CpuRun run = run_of(l, op);
@@ -121,7 +121,7 @@ Status CpuProgram::cut(const CpuWeights& weights) {
 Status CpuProgram::prepare() { return run(prepare_); }
 Status CpuProgram::run() { return run(run_); }
 
-/// Matrices are where the table has them.
+/// Reads the matrices' addresses from the table.
 void CpuProgram::bind() const {
   for (const MatrixUses& phase : uses_)
     for (const auto& [part, matrix] : phase) {
@@ -142,7 +142,7 @@ Status CpuProgram::run(const std::vector<Segment>& segments) {
   return {};
 }
 
-/// Stops behind each phase that makes a value for the visitor, since the next one may overwrite it.
+/// Stops after each phase that makes a tapped value, since the next phase may overwrite it.
 void CpuProgram::run_phases(std::size_t begin, std::size_t end) {
   for (auto next = seen_.lower_bound(begin); begin < end;) {
     const std::size_t stop = next != seen_.end() ? std::min(end, next->first + 1) : end;

@@ -15,7 +15,7 @@
 namespace vla::lower {
 namespace {
 
-/// Threads that read what is streamed, beside so many that compute.
+/// The number of threads that read streamed matrices, beside `n_thread` that compute.
 int n_reader(int n_thread) { return std::max(1, n_thread / 4); }
 
 std::string describe(const std::map<std::string, std::map<std::string, int>>& counts) {
@@ -47,7 +47,7 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
   return weights;
 }
 
-/// How each parameter is kept, and what multiplies by it.
+/// Chooses the storage and the kernel of each parameter.
 Status CpuWeights::choose(const ParamList& list, const Options& options) {
   std::map<std::string, std::map<std::string, int>> counts;
   const auto tables = std::make_shared<Tables>();
@@ -70,7 +70,7 @@ Status CpuWeights::choose(const ParamList& list, const Options& options) {
   return {};
 }
 
-/// Resident parameters one after the other, then the windows.
+/// Places resident parameters one after the other, then the windows.
 Status CpuWeights::give_places(const ParamList& list, const Options& options, const WeightPlan& plan) {
   groups_ = groups_by_id(plan, places_.size());
   const auto size_in_memory = [&](const Param& param) {
@@ -127,7 +127,7 @@ Status CpuWeights::fill(const ParamList& list, const WeightPlan& plan, int n_thr
   const kernels::Phase phase = {{task.get()}, nullptr};
   executor->run({&phase, 1});
   if (has_failed) return content.changed();
-  if (!plan.streamed.empty())  // the system need not keep what memory has
+  if (!plan.streamed.empty())  // drop from the page cache what is now packed in memory
     for (const PackPart& part : parts) content.forget(part.from);
   return {};
 }

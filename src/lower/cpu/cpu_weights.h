@@ -13,62 +13,62 @@
 
 namespace vla::lower {
 
-/// The tables of a policy's bundle.
+/// The embedding tables of a policy's bundle.
 using Tables = std::map<const Param*, std::unique_ptr<TableRows>>;
 
-/// The addresses of parameters, by their ids. Programs look matrices up when a run begins: until then one may move.
+/// Addresses of parameters, by Param::id. Programs look matrices up when a run begins; between runs a matrix may move.
 struct WeightTable {
   struct Entry {
     std::byte* data = nullptr;
-    float* scales = nullptr;  // of the codes of a matrix
+    float* scales = nullptr;  // scales of a quantized matrix
   };
   std::vector<Entry> entries;
-  std::uint64_t version = 1;  // another one after every change
+  std::uint64_t version = 1;  // changes with every move
 
   const Entry& at(const Param* param) const { return entries[static_cast<std::size_t>(param->id)]; }
 };
 
-/// The parameters of a policy for the CPU's kernels. Matrices are packed in panels, encoded as in the bundle or
-/// rounded, and resident or streamed; vectors are copied. Tables stay with the bundle, since a row that is looked up is
-/// widened exactly.
+/// The parameters of a policy for the CPU's kernels. Matrices are packed into panels, encoded as in the bundle or
+/// rounded, and resident or streamed. Vectors are copied. Embedding tables stay in the bundle; a row is widened exactly
+/// when it is looked up.
 class CpuWeights {
  public:
   struct Options {
     Features use;
     Rounding rounding;
     int n_thread;
-    bool fill = true;  // else memory is reserved and never touched
+    bool fill = true;  // false: reserves addresses and touches no memory
   };
-  /// Every parameter must have its source. Errors: out_of_memory, device, bad_bundle where the file has been changed
-  /// since it was opened, unsupported where nothing is worth rounding (graph/rounding.h).
+  /// Every parameter must have a source. Errors: out_of_memory; device; bad_bundle if the file has changed since it was
+  /// opened; unsupported if no matrix is large enough to round (graph/rounding.h).
   static Result<CpuWeights> load(const ParamList& list, const Options& options, const WeightPlan& plan);
 
   const std::byte* data(const Param* param) const { return table_->at(param).data; }
   const float* floats(const Param* vector) const { return reinterpret_cast<const float*>(data(vector)); }
   /// How it lies in memory.
   const Encoding& encoding(const Param* param) const { return place(param).encoding; }
-  /// The kernel that multiplies by a matrix.
+  /// Returns the kernel that multiplies by a matrix.
   const kernels::LinearKernel* kernel(const Param* matrix) const { return place(matrix).kernel; }
   /// Bytes of a matrix.
   std::size_t size_of(const Param& matrix) const { return place(&matrix).size_of(matrix); }
-  /// By Param::id, its group among those of the plan that are streamed, or -1.
+  /// The streamed group of each parameter, by Param::id; -1 if it is resident.
   const std::vector<int>& groups() const { return groups_; }
-  /// The stream that reads those; null where there are none, or nothing is filled.
+  /// The stream of these groups; null if there are none or the weights were not read.
   const std::shared_ptr<WeightStream>& stream() const { return stream_; }
-  /// The addresses of all parameters; programs keep the table.
+  /// The address table of all parameters, which programs keep.
   const std::shared_ptr<WeightTable>& table() const { return table_; }
-  /// All tables that have their source.
+  /// All embedding tables that have a source.
   const std::shared_ptr<const Tables>& tables() const { return tables_; }
-  /// The rows of one of them; null where it has no source.
+  /// The rows of one table; null if it has no source.
   TableRows* rows(const Param* table) const {
     const auto found = tables_->find(table);
     return found != tables_->end() ? found->second.get() : nullptr;
   }
-  /// Whether matrices of floats are int8 codes, as they are stored or rounded.
+  /// Whether matrices of floats become int8 codes here, or are stored so.
   bool has_int8() const;
-  /// Bytes in memory; of tables those of the rows that may be kept, of streamed matrices those of their windows.
+  /// Bytes in memory. A table counts with the rows that may be cached, a streamed matrix with its windows.
   std::size_t size() const { return memory_.size() + table_size_; }
-  /// Which kernel multiplies how many matrices, for display: `avx2 (98 bf16)`.
+  /// The kernels, and how many matrices each multiplies, for display: `avx2 (98 bf16)`.
   const std::string& text() const { return text_; }
 
  private:
@@ -90,7 +90,7 @@ class CpuWeights {
   std::vector<Place> places_;
   std::vector<int> groups_;
   std::string text_;
-  std::shared_ptr<WeightStream> stream_;  // goes before the memory that it writes to
+  std::shared_ptr<WeightStream> stream_;  // destroyed before the memory that it writes to
 };
 
 }  // namespace vla::lower

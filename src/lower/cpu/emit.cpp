@@ -11,16 +11,16 @@
 namespace vla::lower {
 namespace {
 
-/// A product of fewer operations takes about as long as waking a thread.
+/// FLOP below which a product takes no longer than waking a thread.
 constexpr double kMinSharedFlop = 2e6;
-/// Elements of an item of what is not a product.
+/// Elements per item of an operation that is no product.
 constexpr std::int64_t kItemElements = 16384;
 
 template <class Op>
 std::string lines_of(const CpuLowering& l, const CpuOp& op, const CpuRun& run, const Op& what) {
   return line_of(l, op, run.kernel, what.text(), work_of(l, op));
 }
-/// A line for each product of a block.
+/// Prints one line for each product of a block.
 std::string lines_of(const CpuLowering& l, const CpuOp& op, const CpuRun&, const BlockedOp& blocked) {
   std::string lines;
   for (CpuOp product : blocked.products) {
@@ -68,10 +68,11 @@ std::string text_of(const CpuLowering& l, const CpuOp& op, const CpuRun& run) {
   return std::visit([&](const auto& what) { return lines_of(l, op, run, what); }, op.op);
 }
 
-/// The phase stands in front, the number of a block behind a dot, that of a value behind %.
+/// Drops the numbers that only tell places apart: the phase at the start of a line, a layer's after a dot, a value's
+/// after %.
 std::string likeness_of(std::string_view text) {
   std::string likeness;
-  bool in_place = true;  // numbers are left out
+  bool in_place = true;  // digits here are dropped
   for (const char c : text) {
     if (in_place && (c == ' ' || (c >= '0' && c <= '9'))) continue;
     likeness += c;
@@ -93,7 +94,7 @@ Work work_of(const CpuLowering& l, const CpuOp& op) {
     work.bytes += static_cast<double>(size);
   };
   const auto* lookup = std::get_if<LookupOp>(&op.op);
-  // Of a table only the rows that are looked up are read.
+  // Only the looked-up rows of a table are read.
   for (const ValueId id : op.reads) add(lookup != nullptr && id == lookup->table ? op.writes[0] : id);
   for (const ValueId id : op.writes) add(id);
   if (const auto* linear = std::get_if<LinearOp>(&op.op)) {

@@ -19,21 +19,21 @@ using kernels::Task;
 using kernels::task_of;
 using kernels::Worker;
 
-/// A matrix, and where a task keeps its address.
+/// A matrix, and the field of the task that holds its address.
 struct MatrixUse {
   kernels::LinearJob::Part* part;
   const Param* matrix;
 };
 using MatrixUses = std::vector<MatrixUse>;
 
-/// How the CPU runs an operation: a file of lower/cpu/ops says it, all of it.
+/// How the CPU runs an operation. Each file of lower/cpu/ops returns one.
 #pragma GCC diagnostic error "-Wmissing-field-initializers"
 struct CpuRun {
-  std::string kernel;          // as a printed program names it
-  KindClock::Kind kind;        // that its time counts for
-  std::size_t scratch;         // bytes that a worker needs
-  std::unique_ptr<Task> task;  // what the executor runs, with all addresses but those of matrices
-  MatrixUses matrices = {};    // which get theirs before each run
+  std::string kernel;          // kernel name in a printed program
+  KindClock::Kind kind;        // the clock that its time is added to
+  std::size_t scratch;         // bytes of scratch memory per worker
+  std::unique_ptr<Task> task;  // run by the executor; all addresses are set but those of matrices
+  MatrixUses matrices = {};    // their addresses are set before each run
 };
 #define VLA_RUN_OP(Op) CpuRun run_of(const CpuLowering& l, const CpuOp& op, const Op& what);
 VLA_LOWERED_OPS(VLA_RUN_OP)
@@ -41,18 +41,18 @@ VLA_RUN_OP(PackOp)
 VLA_RUN_OP(BlockedOp)
 #undef VLA_RUN_OP
 
-/// When every value has its address.
+/// Call it once every value has an address.
 CpuRun run_of(const CpuLowering& l, const CpuOp& op);
-/// Operations and bytes of an operation.
+/// FLOP and bytes of an operation.
 Work work_of(const CpuLowering& l, const CpuOp& op);
-/// One line: what is computed, the kernel, shapes and layouts.
+/// Prints an operation: text, kernel, shapes and layouts.
 std::string text_of(const CpuLowering& l, const CpuOp& op, const CpuRun& run);
-/// Such a line without the numbers that tell places apart: operations that share it take the same time.
+/// The same line without the numbers that tell places apart: operations with equal lines take the same time.
 std::string likeness_of(std::string_view text);
 
-// What files of lower/cpu/ops share.
+// Shared by the files of lower/cpu/ops.
 
-/// Rows that are cut into items for the threads.
+/// Cuts rows into items for the threads.
 struct RowItems {
   /// d: elements of a row.
   RowItems(const CpuLowering& l, std::int64_t n_row, std::int64_t d);
@@ -67,7 +67,7 @@ inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]
 inline std::byte* address(const CpuLowering& l, ValueId id) {
   return l.address(l.value(id).base) + dtype_size(l.value(id).type, l.value(id).offset);
 }
-/// Null for an operand that there is not.
+/// Null if the operand is missing.
 inline float* floats(const CpuLowering& l, ValueId id) {
   return id != kNone ? reinterpret_cast<float*>(address(l, id)) : nullptr;
 }
@@ -77,11 +77,11 @@ inline kernels::RowKernel norm_kernel(const CpuLowering& l, const op::Norm& norm
 }
 kernels::LinearJob::Norm norm_of(const CpuLowering& l, const Node* norm, ValueId weight, ValueId bias);
 kernels::Window window_of(const Shape& x, const op::Window& window, const Shape& y);
-/// Threads that share an operation.
+/// How many threads share an operation of this FLOP.
 int threads_for(const CpuLowering& l, double flop);
-/// Keys and values as a kernel's job, without addresses.
+/// The sizes of a PackJob, without addresses.
 kernels::PackJob pack_sizes(const CpuLowering& l, const PackOp& op);
-/// A product's job, and where matrices will have their addresses.
+/// The job of a product, and the fields for its matrices' addresses.
 kernels::LinearJob job_of(const CpuLowering& l, const CpuOp& op, const LinearOp& linear);
 void note_uses(const LinearOp& linear, kernels::LinearJob& job, MatrixUses& uses);
 

@@ -64,7 +64,7 @@ class CpuLayouts final : Layouts {
     return kernels::cpu_kernels(l.features(rounds))->attention;
   }
 
-  /// Stores a value that only products and attention read as they would round it.
+  /// Stores a value rounded if only products and attention read it, which would round it anyway.
   void round_result(ValueId id, kernels::RoundedLayout layout) {
     Value& y = l.value(id);
     if (layout == kernels::RoundedLayout::none || y.placement != Value::Placement::arena) return;
@@ -79,8 +79,8 @@ class CpuLayouts final : Layouts {
     y.size = static_cast<std::size_t>(kernels::rounded_count(layout, count(y.shape) / y.shape[0], y.shape[0])) * 2;
   }
 
-  /// Whether an operation may find a value that it reads, or view of one, rounded: as the product of a whole value, or
-  /// as rows of heads to which attention does nothing first.
+  /// Whether an operation can read a value, or a view of it, rounded: a product reads the whole value; attention reads
+  /// rows of heads that it neither norms nor rotates first.
   bool takes(const CpuOp& op, ValueId id, kernels::RoundedLayout layout) const {
     if (const auto* linear = std::get_if<LinearOp>(&op.op))
       return id == linear->x && id == l.value(id).base && linear->norm == nullptr && linear->unfold == nullptr &&
@@ -95,7 +95,7 @@ class CpuLayouts final : Layouts {
     return false;
   }
 
-  /// Each head of a token or batch is part of one row of the base.
+  /// Each head of a token or batch must be part of one row of the base.
   bool lies_in_rows(ValueId id) const {
     const Value& x = l.value(id);
     const std::int64_t d = l.base(id).shape[0];
@@ -104,7 +104,7 @@ class CpuLayouts final : Layouts {
   }
 
   CpuLowering& l;
-  // Of each base: who reads it or a view of it, and itself with its views.
+  // For each base: the operations that read it or a view of it, and the value with its views.
   std::map<ValueId, std::vector<std::pair<const CpuOp*, ValueId>>> reads_;
   std::map<ValueId, std::vector<Value*>> views_;
 };

@@ -7,16 +7,16 @@
 
 namespace vla {
 
-/// The features that kernels may use to compute with these parameters, of `use`. Tiles of bf16 round whatever they
-/// multiply. A bundle asks for that by storing matrices as bf16: those are multiplied so, and attention of queries that
-/// they make rounds too. Matrices of another dtype, and attention of their queries, are float32, as they are in
-/// PyTorch: pi0's tower beside its language model. Without any of bf16 everything is. What is rounded counts as it is
-/// in memory, and int8 as bf16.
+/// Limits `use` to the features that kernels may use with these parameters. AMX and bf16 tiles round whatever they
+/// multiply; a bundle permits that by storing matrices as bf16. Then products with these matrices round, and so does
+/// attention whose queries they make. Other products, and attention over their queries, stay float32, as in PyTorch
+/// (pi0's vision tower beside its language model). A bundle without bf16 matrices computes in float32. Matrices rounded
+/// at load count with the dtype they have in memory, and int8 counts as bf16.
 Features features_for(const ParamList& list, Features use, Rounding rounding = Rounding::none);
 
-/// Attention over fewer keys rounds nothing on any machine: it takes little time, and each output mixes so few values
-/// that their errors hardly cancel. Between ternary products they must cancel better: a number that is rounded before
-/// it is quantized may get another code, which is an error of a hundredth and more of a row's greatest.
+/// Fewest keys of attention that rounds, on any machine. Over few keys each output averages so few values that rounding
+/// errors do not cancel, and attention takes little time anyway. Between ternary products errors must cancel better: a
+/// number rounded before it is quantized may get another code, an error of 1 % or more of the row's maximum.
 std::int64_t min_rounded_keys(const ParamList& list);
 
 }  // namespace vla

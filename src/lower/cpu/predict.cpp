@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// How long a program takes on this machine, from one phase of each kind: of a network of equal blocks those of one
-// block are timed, in their order, and all blocks are counted. What is timed finds its weights in a cache, since they
-// read as zeros: what it takes to read them from memory comes on top.
+// Predicts how long a program takes on this machine. One phase of each kind is timed, in the program's order, and
+// counted as often as it occurs: of a network of equal blocks, one block is timed. The weights read as zeros and so
+// come from a cache; the time to read them from memory is added.
 #include <algorithm>
 #include <chrono>
 #include <limits>
@@ -18,14 +18,15 @@ namespace {
 using Clock = std::chrono::steady_clock;
 using Seconds = std::chrono::duration<double>;
 
-constexpr int kMinRuns = 3, kMaxRuns = 50;  // of the chosen phases, behind one that touches memory for the first time
-constexpr double kWanted = 0.2;             // seconds: so long for more runs than the fewest
-constexpr double kBandwidthTime = 0.1;      // seconds
+// Runs of the chosen phases, after one run that touches the memory for the first time.
+constexpr int kMinRuns = 3, kMaxRuns = 50;
+constexpr double kWanted = 0.2;         // seconds; phases run more often than kMinRuns until it is spent
+constexpr double kBandwidthTime = 0.1;  // seconds
 
 }  // namespace
 
-/// The fastest of several runs, since what other programs take is not the machine's. The second phase of a kind is
-/// chosen: the first one may follow something that comes only once.
+/// Takes the fastest of several runs, to exclude the time of other programs. Times the second phase of each kind, since
+/// the first may follow something that occurs only once.
 std::vector<double> CpuProgram::seconds_of_kinds() const {
   std::vector<std::size_t> chosen;  // by kind
   std::vector<int> n_met;

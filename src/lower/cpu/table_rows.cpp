@@ -10,7 +10,7 @@ namespace vla::lower {
 namespace {
 
 constexpr std::int64_t kMostKept = 1024, kNoRow = -1;
-/// Places where a row may be kept.
+/// Places in which a row may be cached.
 constexpr std::int64_t kTries = 16;
 
 }  // namespace
@@ -21,12 +21,12 @@ Result<std::unique_ptr<TableRows>> TableRows::make(const Bundle& bundle, const P
   rows->content_ = bundle.content(), rows->table_ = table.source->data;
   rows->row_size_ = rows->table_.size() / n_row;
   rows->index_.assign(n_kept, kNoRow);
-  rows->buffer_.take(Content::buffer_size(rows->row_size_));  // so that a look-up takes no memory
+  rows->buffer_.take(Content::buffer_size(rows->row_size_));  // allocated up front, so that a lookup allocates nothing
   VLA_TRY(rows->kept_, Memory::allocate(n_kept * rows->row_size_, "rows of " + table.name));
   return rows;
 }
 
-/// The place where row i is, or may be kept: `index_` tells which.
+/// The cache place for row i; `index_` says which row it holds.
 std::byte* TableRows::place(std::int64_t i) {
   const auto n = static_cast<std::int64_t>(index_.size());
   std::int64_t at = i % n;

@@ -10,19 +10,19 @@
 
 namespace vla::lower {
 
-/// Rows of a table, which stays where the bundle has it: of a vocabulary's embeddings an observation reads a few. A row
-/// is read when it is looked up first; the last thousand are kept. Threads may share it.
+/// Rows of an embedding table that stays in the bundle's file: an observation reads few rows of a vocabulary. A row is
+/// read at its first lookup, and the last thousand are cached. Safe for several threads.
 class TableRows {
  public:
   /// Errors: out_of_memory.
   static Result<std::unique_ptr<TableRows>> make(const Bundle& bundle, const Param& table);
 
-  /// Row i as it is stored; zeros where the bundle has not this row any more, which `status` then tells.
+  /// Copies row i as stored. Copies zeros if the file no longer has the row; `status` then returns the error.
   void copy(std::int64_t i, std::byte* to);
   std::size_t row_size() const { return row_size_; }
-  /// The status of the rows copied since it was last asked for. Errors: bad_bundle, where the file has been changed.
+  /// Returns and clears the status of the rows copied since the last call. Errors: bad_bundle if the file has changed.
   Status status();
-  /// Bytes of the rows that are kept, at most.
+  /// Maximum bytes of the cache.
   std::size_t size() const { return kept_.size(); }
 
  private:
@@ -33,7 +33,7 @@ class TableRows {
   std::span<const std::byte> table_;
   std::size_t row_size_ = 0;
   Memory kept_;
-  std::vector<std::int64_t> index_;  // of the row in each place
+  std::vector<std::int64_t> index_;  // row held in each place
   ReadBuffer buffer_;
   bool has_changed_ = false;
   std::mutex mutex_;

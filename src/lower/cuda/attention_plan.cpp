@@ -12,11 +12,11 @@ std::int64_t count_keys(const AttentionOp& op) {
   return std::accumulate(op.n_key.begin(), op.n_key.end(), std::int64_t{0});
 }
 
-/// Microseconds of a block's begin with its first loads, and of the kernel that combines shares.
+/// Microseconds: start of a block with its first loads; the kernel that combines shares of the keys.
 constexpr double kBegin = 1.5, kFinish = 2;
-/// What part of a block's time each further one on the same SM adds.
+/// Each further block on an SM adds this fraction of a block's time.
 constexpr double kFurther = 0.6;
-/// Bytes of partial sums that an SM's part of the cache moves in a microsecond.
+/// Bytes of partial sums that one SM moves through the L2 cache per microsecond.
 constexpr double kPartial = 40e3;
 
 double microseconds(const cuda::AttentionShape& shape, std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit,
@@ -56,7 +56,7 @@ AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op) {
     const std::int64_t n_head_kv = l.value(op.packed[0]).shape[1];
     return plan_attention(q[0], q[1] / n_head_kv * q[2], n_head_kv * q[3], n_key, l.n_sm);
   }
-  const std::int64_t n_block = q[1] * q[3] * ((q[2] + 7) / 8);  // at least so many
+  const std::int64_t n_block = q[1] * q[3] * ((q[2] + 7) / 8);  // a lower bound
   const std::int64_t most = std::min<std::int64_t>((n_key + 127) / 128, cuda::kMaxAttentionSplit);
   return {nullptr, static_cast<int>(std::clamp<std::int64_t>(l.n_sm / n_block, 1, most))};
 }

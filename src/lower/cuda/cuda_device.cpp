@@ -11,12 +11,12 @@ namespace vla::lower {
 namespace {
 
 constexpr std::int64_t kNoLimit = std::numeric_limits<std::int64_t>::max();
-/// Attention over fewer keys mixes so few values that their errors hardly cancel, and takes little time in float32.
+/// Fewest keys of attention in bf16. Over fewer keys rounding errors do not cancel, and float32 takes little time.
 constexpr std::int64_t kMinRoundedKeys = 32;
 
-/// Kernels that round x norm it on the way.
+/// Kernels that round x apply its norm, too.
 Multiplier multiplier_of(const CudaWeight& weight) {
-  static constexpr char kKinds[4] = {};  // places to tell them apart
+  static constexpr char kKinds[4] = {};  // distinct addresses, to tell kernels apart
   const std::int64_t max_norm = weight.kind == MatrixKind::f32 ? 0 : kNoLimit;
   return {&kKinds[static_cast<int>(weight.kind)], max_norm, false, true, &weight.encoding};
 }
@@ -43,9 +43,9 @@ Result<std::unique_ptr<Device>> CudaDevice::model(const std::string& name, Round
 Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan& plan) {
   if (model_ && fill) return Error{Code::usage, "model", "a device that is there", name_, "it says times alone"};
   queue_->set_dry(!fill);
-  arena_.reset();  // it may be that of a dry load
+  arena_.reset();  // a dry load leaves one without memory
   VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, plan, queue_));
-  // Attention rounds where products do.
+  // Attention rounds if products do.
   const bool rounds = weights_.has(MatrixKind::bf16) || weights_.has(MatrixKind::int8);
   min_rounded_keys_ = rounds ? kMinRoundedKeys : kNoLimit;
   return {};
@@ -73,7 +73,7 @@ Status CudaDevice::allocate(Slots& slots) {
   cuda::Address place = memory->address();
   for (Slot& slot : slots.all()) slot.place = reinterpret_cast<void*>(place), place += device_aligned(slot.size());
   VLA_CHECK(queue_->fill_zeros(*memory));
-  // With the device, which must not go before its memory.
+  // Keeps the device alive as long as its memory.
   slots.hold(std::make_shared<std::pair<std::shared_ptr<CudaQueue>, std::shared_ptr<cuda::Buffer>>>(queue_, memory),
              size);
   return {};
@@ -107,7 +107,7 @@ Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const Low
   store(l, ops);
   choose_layouts(l, std::move(ops));
   arrange(l, l.ops);
-  if (!arena_ || l.arena_size > arena_->size()) {  // programs made before keep the memory that they were given
+  if (!arena_ || l.arena_size > arena_->size()) {  // programs that exist keep the arena that they were given
     VLA_TRY(arena_, queue_->allocate(l.arena_size, "working memory"));
   }
   return CudaProgram::make(l, queue_, {weights_.memory(), arena_}, model_ ? &*model_ : nullptr);

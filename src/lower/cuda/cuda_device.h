@@ -9,13 +9,13 @@
 
 namespace vla::lower {
 
-/// A GPU that our own kernels run on (cuda/kernels). What an act asks for is one captured graph.
+/// A GPU that runs our own kernels (cuda/kernels). An act is one captured graph.
 class CudaDevice final : public Device {
  public:
-  /// modules: the kernels as PTX. at_load: as CudaWeights::load takes it. Errors: device, unsupported for int4.
+  /// modules: the kernels' PTX. at_load: see CudaWeights::load. Errors: device, unsupported for int4.
   static Result<std::unique_ptr<Device>> open(const cuda::Driver& driver, int index,
                                               const std::vector<std::string>& modules, Rounding at_load);
-  /// A GPU that is not there (DeviceLibrary::model). Errors: usage for an unknown name, unsupported.
+  /// Models a GPU that is not present (DeviceLibrary::model). Errors: usage for an unknown name, unsupported.
   static Result<std::unique_ptr<Device>> model(const std::string& name, Rounding at_load);
 
   Status load(const ParamList& params, bool fill, const WeightPlan& plan) override;
@@ -45,7 +45,7 @@ class CudaDevice final : public Device {
 
   std::string name_;
   std::optional<GpuModel> model_;
-  std::shared_ptr<CudaQueue> queue_;  // goes after all memory
+  std::shared_ptr<CudaQueue> queue_;  // destroyed after all device memory
   CudaWeights weights_;
   std::shared_ptr<cuda::Buffer> arena_;
   Rounding rounding_;

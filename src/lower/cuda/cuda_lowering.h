@@ -7,10 +7,10 @@
 #include "lower/cuda/cuda_weights.h"
 #include "lower/ops.h"
 
-/// The passes of a GPU: what its kernels need to lie contiguously, and a launch for each operation.
+/// A GPU's passes: copy operands that kernels need contiguous, and make launches of each operation.
 namespace vla::lower {
 
-/// Rows of heads, normed and turned, for attention, which may want them as bf16.
+/// Norms and rotates rows of heads for attention, and converts them to bf16 if attention reads that.
 struct HeadOp {
   HeadRows rows;
 
@@ -20,9 +20,9 @@ struct HeadOp {
 
 struct CudaOp : Step {
   AnyOp<HeadOp> op;
-  ValueId gate = kNone;     // of a gated product, what its first matrix makes; none where one kernel multiplies both
-  int n_split = 1;          // shares of the depth, or of keys, of blocks of their own
-  ValueId partial = kNone;  // what those leave
+  ValueId gate = kNone;     // the gate product's result, if no kernel computes gate and up together
+  int n_split = 1;          // shares of the depth (product) or keys (attention), each with its own blocks
+  ValueId partial = kNone;  // the shares' partial results
 };
 
 struct CudaLowering : Lowering {
@@ -30,9 +30,9 @@ struct CudaLowering : Lowering {
   int n_sm;  // blocks that run at a time
   bool is_hopper;
   std::vector<CudaOp> ops = {};
-  std::vector<cuda::Address> data = {};  // of each base, when memory is there
+  std::vector<cuda::Address> data = {};  // of each base, once memory is allocated
 
-  /// Elements of values that are not float32 are those of a whole base.
+  /// A value that is not float32 must be a whole base.
   cuda::Address address(ValueId id) const {
     const Value& v = value(id);
     return data[static_cast<std::size_t>(v.base)] + static_cast<cuda::Address>(v.offset) * 4;
@@ -48,13 +48,13 @@ struct CudaLowering : Lowering {
   const CudaWeight& matrix(const Node& linear) const { return weights[*linear.as<op::Linear>()->weight]; }
 };
 
-/// Has operations read what their kernels can: copies what lies otherwise, rounds what is multiplied as bf16 or codes,
-/// and norms and turns heads before attention, which takes keys and values where they lie, or as bf16. What is only
-/// rounded is stored so at once. Also how the depth of a product is split.
+/// Makes operands readable for the kernels: copies those of the wrong layout, converts inputs of bf16 and int8
+/// products, norms and rotates heads before attention (which reads keys and values in place, or as bf16). A value with
+/// only such readers is stored rounded. Also splits the depth of products.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 
-/// How blocks of a product cut rows: in 128, in 64, or few rows bound by reading the matrix; strips are of so many
-/// columns of up to 64 rows; Hopper has tiles of its own. And how many shares of the depth have blocks of their own.
+/// How a product is cut into blocks: tiles of 128 or 64 rows; for few rows a shape bound by reading the matrix; strips
+/// of some columns of up to 64 rows; or a Hopper tile. Also into how many shares the depth is split.
 enum class ProductShape { few, strip16, strip32, strip64, strip128, rows64, rows128, hopper };
 /// Columns of a strip; 0 for other shapes.
 constexpr std::int64_t strip_width(ProductShape shape) {
@@ -67,29 +67,29 @@ constexpr std::int64_t strip_width(ProductShape shape) {
 struct ProductCut {
   ProductShape shape;
   int n_split;
-  std::size_t tile = 0;  // of kHopperTiles or kHopperInt8Tiles
-  double us = 0;         // that it takes on Hopper, as it was estimated
+  std::size_t tile = 0;  // index into kHopperTiles or kHopperInt8Tiles
+  double us = 0;         // estimated time on Hopper
 };
-/// The width of strips of several products together whose depth is not split, 16 to 64.
+/// The strip width, 16 to 64, for several products in one launch without split depth.
 unsigned common_width(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
-/// The tile for Hopper that takes the shortest time.
+/// The Hopper tile with the shortest estimated time.
 ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, bool is_gated,
                           int n_sm);
-/// is_gated: one kernel multiplies both matrices of a gated product, which have n_column together.
+/// is_gated: one kernel computes gate and up, which have n_column columns together.
 ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
                        std::int64_t depth, bool is_gated);
 
-/// How blocks cut rows of queries and shares of keys.
+/// How attention is cut into blocks of query rows and shares of the keys.
 struct AttentionPlan {
-  const cuda::AttentionShape* shape;  // on tensor cores, else null
+  const cuda::AttentionShape* shape;  // null: no tensor cores
   int n_split;
 };
-/// The fastest on tensor cores, by estimates. n_row: of each of n_unit heads of keys in a batch.
+/// The tensor-core plan with the shortest estimated time. n_row: query rows of each of the n_unit key heads of a batch.
 AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key,
                              int n_sm);
 AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op);
 
-/// As Program::work counts it.
+/// FLOP and bytes, see Program::work.
 Work work_of(const CudaLowering& l, const CudaOp& op);
 
 }  // namespace vla::lower

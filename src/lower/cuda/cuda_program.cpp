@@ -62,7 +62,7 @@ CudaProgram::~CudaProgram() {
 Status CudaProgram::run(const std::vector<Piece>& pieces) {
   for (const Piece& piece : pieces) {
     if (piece.groups.any()) {
-      VLA_CHECK(queue_->flush());  // the device computes what was asked while these come
+      VLA_CHECK(queue_->flush());  // the device computes already while these are copied
       VLA_CHECK(windows_->bring(piece.groups));
     }
     VLA_CHECK(queue_->run(piece.part));
@@ -106,7 +106,7 @@ std::vector<CudaProgram::Piece> CudaProgram::pieces(const std::vector<Segment>& 
   return pieces;
 }
 
-/// A mark behind the last phase of each stage, and one at the end.
+/// Marks the end of each stage's last phase, and the end.
 Status CudaProgram::make_marks(const CudaLowering& l) {
   const std::size_t n_run = reads_.size() - n_prepare_;
   std::vector<std::size_t> ends(stages_.size(), 0);

@@ -9,10 +9,10 @@
 
 namespace vla::lower {
 
-/// Launches in phases that their operands allow.
+/// Launches, grouped into phases.
 class CudaProgram final : public Program {
  public:
-  /// The last pass: addresses and launches. Errors: device, out_of_memory, unsupported.
+  /// The last pass: assigns addresses and makes launches. Errors: device, out_of_memory, unsupported.
   static Result<std::unique_ptr<Program>> make(CudaLowering& l, std::shared_ptr<CudaQueue> queue,
                                                std::vector<std::shared_ptr<cuda::Buffer>> memory,
                                                const GpuModel* model);
@@ -28,7 +28,7 @@ class CudaProgram final : public Program {
   std::vector<float> tap(std::size_t i) const override;
   std::string text() const override { return text_; }
   std::size_t size() const override { return own_->size(); }
-  /// The matrices that each phase reads: first those of `prepare`, then those of `run`.
+  /// Returns the matrices that each phase reads: the phases of `prepare`, then those of `run`.
   const MatrixReads& reads() const { return reads_; }
   std::size_t n_prepare() const { return n_prepare_; }
 
@@ -37,7 +37,7 @@ class CudaProgram final : public Program {
     cuda::Address data;
     Shape shape, stride;
   };
-  /// A part that is launched once its groups are on the device.
+  /// A part of the run that is launched once its groups of matrices are on the device.
   struct Piece {
     Groups groups;
     CudaPart part;
@@ -45,16 +45,16 @@ class CudaProgram final : public Program {
   static std::vector<Piece> pieces(const std::vector<Segment>& segments, std::vector<std::vector<Calls>>& phases);
   Status run(const std::vector<Piece>& pieces);
   Status give_addresses(CudaLowering& l, const cuda::Buffer& arena);
-  /// How many kernels each operation is.
+  /// The number of kernels per operation.
   Result<std::vector<int>> make_parts(const CudaLowering& l);
   Status make_marks(const CudaLowering& l);
   void make_taps(const CudaLowering& l);
 
   std::shared_ptr<CudaQueue> queue_;
   std::vector<std::shared_ptr<cuda::Buffer>> memory_;  // weights and arena
-  std::shared_ptr<cuda::Buffer> own_;                  // what prepare leaves, and constants
-  std::shared_ptr<DeviceWindows> windows_;             // null where all matrices are resident
-  std::vector<Piece> prepare_, run_;                   // one, but where there are windows
+  std::shared_ptr<cuda::Buffer> own_;                  // results of prepare, and constants
+  std::shared_ptr<DeviceWindows> windows_;             // null if all matrices are resident
+  std::vector<Piece> prepare_, run_;                   // one, or several if weights are streamed
   MatrixReads reads_;
   std::size_t n_prepare_ = 0;
   std::vector<Stage> stages_;

@@ -8,11 +8,12 @@
 namespace vla::lower {
 namespace {
 
-/// Streams that a graph forks to: products of one x are three at most, and four small kernels fill no device.
+/// Streams that a captured graph forks into: at most three products share an x, and four small kernels do not fill a
+/// device.
 constexpr std::size_t kStreams = 4;
-/// A driver takes about as many nodes as it has memory for; many steps are several launches.
+/// Most nodes of a graph; drivers run out of memory beyond. A longer act is several launches.
 constexpr std::size_t kMaxLaunches = 20000;
-/// Slots begin at multiples of it, so that what is missing between two of them is padding.
+/// Alignment of slots; a smaller gap between two slots is padding.
 constexpr std::size_t kPadding = 256;
 
 std::size_t n_launch(const CudaPart& part) {
@@ -53,7 +54,7 @@ Result<std::shared_ptr<cuda::Buffer>> CudaQueue::allocate(std::size_t size, cons
   VLA_CHECK(failure_);
   Result<cuda::Buffer> made = gpu_->allocate(size, what);
   if (made) return std::make_shared<cuda::Buffer>(std::move(*made));
-  // Memory may be there later; a device that failed is not.
+  // Out of memory may pass; a failed device stays failed.
   if (made.error().code != Code::out_of_memory) static_cast<void>(keep(made.error()));
   return made.error();
 }
@@ -92,14 +93,14 @@ void CudaQueue::set(cuda::Address to, const void* from, std::size_t size) {
 
 Status CudaQueue::stage(cuda::Address to, const void* from, std::size_t size) {
   VLA_CHECK(gpu_->use());
-  VLA_CHECK(launch());  // it reads what was there before
+  VLA_CHECK(launch());  // queued work reads the old bytes
   std::size_t gap = kPadding;
   if (!uploads_.empty()) {
     const cuda::Address end = uploads_.back().to + uploads_.back().size;
     if (to >= end && to - end < kPadding) gap = static_cast<std::size_t>(to - end);
   }
   const bool joins = gap < kPadding;
-  if (n_staged_ + size + kPadding > staging_.size) {  // until there is room for all that an act sets
+  if (n_staged_ + size + kPadding > staging_.size) {  // grow until all inputs of an act fit
     const std::size_t enough = 2 * (n_staged_ + size) + kPadding;
     VLA_CHECK(start_uploads());
     VLA_CHECK(wait());
@@ -128,7 +129,7 @@ void CudaQueue::take(cuda::Address to, const CudaSent& sent, std::size_t size) {
 Status CudaQueue::copy(cuda::Address to, const CudaSent& sent, std::size_t size) {
   VLA_CHECK(sent.status());
   VLA_CHECK(gpu_->use());
-  VLA_CHECK(launch());  // it reads what was there before
+  VLA_CHECK(launch());  // queued work reads the old bytes
   VLA_CHECK(start_uploads());
   VLA_CHECK(main_->after(sent.arrived()));
   return main_->copy(to, sent.address(), size);
@@ -201,7 +202,7 @@ Status CudaQueue::wait() {
   return {};
 }
 
-/// Device times end when waiting has: from there they are counted back.
+/// Device times are counted back from the end of the wait.
 Status CudaQueue::note_times() {
   const auto now = std::chrono::steady_clock::now();
   const Parts parts = std::move(launched_);
@@ -227,7 +228,7 @@ Status CudaQueue::capture(const Parts& parts) {
   return {};
 }
 
-/// Operations of a phase take turns on as many streams as there are.
+/// The operations of a phase are spread over the streams.
 Status CudaQueue::capture(const CudaPart& part) {
   auto mark = part.marks.begin();
   for (std::size_t phase = 0; phase <= part.phases.size(); ++phase) {

@@ -13,20 +13,20 @@ namespace vla::lower {
 
 class CudaSent;
 
-/// Sends bytes to a device while it computes: over a stream of their own, to memory beside the slots, which the act
-/// before may still read. Any thread may send.
+/// Sends bytes to a device while it computes, over a separate stream and to memory beside the slots, which the previous
+/// act may still read. Safe for any thread.
 class CudaSender : public std::enable_shared_from_this<CudaSender> {
  public:
   /// Errors: device.
   static Result<std::shared_ptr<CudaSender>> open(std::shared_ptr<cuda::Gpu> gpu);
   ~CudaSender();
 
-  /// Null where memory is short.
+  /// Returns null if memory is short.
   std::unique_ptr<CudaSent> send(const void* data, std::size_t size);
 
  private:
   friend class CudaSent;
-  /// Memory of the host that the device reads by itself, as much on the device, and what stands for the way between.
+  /// Page-locked host memory, as much device memory, and the event of the copy between them.
   struct Parcel {
     std::size_t size;
     cuda::Owned host;
@@ -41,11 +41,11 @@ class CudaSender : public std::enable_shared_from_this<CudaSender> {
   std::shared_ptr<cuda::Gpu> gpu_;
   cuda::Stream stream_;
   std::mutex mutex_;
-  std::vector<std::unique_ptr<Parcel>> idle_;  // as many as were on their way at once
+  std::vector<std::unique_ptr<Parcel>> idle_;  // as many as were ever in transit at once
   std::size_t n_made_ = 0;
 };
 
-/// A parcel that was sent, or the reason why it was not.
+/// A sent parcel, or why it was not sent.
 class CudaSent final : public Device::Sent {
  public:
   ~CudaSent() override;

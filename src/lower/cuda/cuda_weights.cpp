@@ -85,7 +85,7 @@ Result<CudaWeights> CudaWeights::load(const ParamList& list, Rounding rounding, 
   return weights;
 }
 
-/// How each parameter is kept, and what multiplies by it.
+/// Chooses the storage and the kernel of each parameter.
 void CudaWeights::choose(const ParamList& list, Rounding rounding) {
   std::map<std::pair<MatrixKind, std::string>, int> counts;
   for (const Param& param : list.params()) {
@@ -99,7 +99,7 @@ void CudaWeights::choose(const ParamList& list, Rounding rounding) {
              std::to_string(n) + " " + what.second + ")";
 }
 
-/// Resident parameters one after the other, then the windows.
+/// Places resident parameters one after the other, then the windows.
 Status CudaWeights::give_places(const ParamList& list, const WeightPlan& plan, CudaQueue& queue) {
   groups_ = groups_by_id(plan, all_.size());
   std::size_t size = 0;

@@ -9,11 +9,11 @@
 
 namespace vla::lower {
 
-/// Windows that groups of matrices come to over a stream of its own, while kernels read others. Those of the host are
-/// page-locked: the device takes what is in them by itself.
+/// Copies groups of matrices into windows of device memory over a separate stream, while kernels read other windows.
+/// The host's windows are page-locked, so that the device reads them itself.
 class CudaWindows final : public WindowMemory {
  public:
-  /// device: where the first of the windows is, each of `size` bytes. Errors: device, out_of_memory.
+  /// device: address of the first window; each has `size` bytes. Errors: device, out_of_memory.
   static Result<std::unique_ptr<WindowMemory>> open(std::shared_ptr<CudaQueue> queue, cuda::Address device,
                                                     std::size_t size);
   ~CudaWindows() override;
@@ -26,7 +26,7 @@ class CudaWindows final : public WindowMemory {
   CudaWindows(std::shared_ptr<CudaQueue> queue, cuda::Stream copies, cuda::Address device, std::size_t size)
       : queue_(std::move(queue)), copies_(std::move(copies)), device_(device), size_(size) {}
   std::size_t offset(int window) const { return static_cast<std::size_t>(window) * size_; }
-  /// Stands for all kernels that read a window until now.
+  /// Recorded after the kernels that read a window so far.
   const cuda::Owned& read(int window) const { return read_[static_cast<std::size_t>(window)]; }
   Status copy(int window, std::size_t size);
 

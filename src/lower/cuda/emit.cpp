@@ -39,7 +39,7 @@ Work work_of(const CudaLowering& l, const CudaOp& op) {
       work.weights += bits_of(kind) / 8 * static_cast<double>(node->as<op::Linear>()->weight->count());
     }
   if (const auto* lookup = std::get_if<LookupOp>(&op.op); lookup != nullptr && lookup->table != kNone)
-    work.bytes -= size_of(l.value(lookup->table));  // some rows of it alone, as many as there are results
+    work.bytes -= size_of(l.value(lookup->table));  // a table: only as many rows as there are results
   work.bytes += work.weights;
   return work;
 }

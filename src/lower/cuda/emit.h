@@ -10,7 +10,8 @@
 
 namespace vla::lower {
 
-/// The launches of an operation: a file of lower/cuda/ops says them. Errors: unsupported for sizes that no kernel has.
+/// Returns the launches of an operation; each file of lower/cuda/ops defines one. Errors: unsupported for sizes that no
+/// kernel has.
 #define VLA_CALLS_OF_OP(Op) Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const Op& what);
 VLA_LOWERED_OPS(VLA_CALLS_OF_OP)
 VLA_CALLS_OF_OP(HeadOp)
@@ -20,7 +21,7 @@ Result<Calls> emit(const CudaLowering& l, const CudaOp& op);
 /// The operation's line of Program::text.
 std::string text_of(const CudaLowering& l, const CudaOp& op, const Calls& calls);
 
-// What files of lower/cuda/ops share.
+// Shared by the files of lower/cuda/ops.
 
 template <class Job>
 Call call(const cuda::Launch& how, const Job& job) {
@@ -32,7 +33,7 @@ inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]
 /// more: "heads of at most".
 Error unsupported(const char* what, const char* more, std::int64_t most, std::int64_t found);
 
-/// Element by element over a shape of up to six dimensions, the fastest first; b may be missing.
+/// Launches an element-wise kernel over a shape of up to six dimensions, fastest first; b is optional.
 template <class Extents>
 cuda::MapJob map_job(const Extents& shape, const float* a, const Extents& a_stride, float* y, const Extents& y_stride) {
   cuda::MapJob job = {};
@@ -43,10 +44,10 @@ cuda::MapJob map_job(const Extents& shape, const float* a, const Extents& a_stri
   std::copy(y_stride.begin(), y_stride.end(), job.y_step);
   return job;
 }
-/// Rows of x, normed unless there is no norm, to the operation's result.
+/// Norms rows of x (unless norm is null) into the operation's result.
 cuda::NormJob norm_job(const CudaLowering& l, const CudaOp& op, ValueId x, const Node* norm, ValueId weight,
                        ValueId bias);
-/// Heads of a value, normed or turned, to the operation's result.
+/// Norms or rotates heads into the operation's result.
 Result<Calls> head_calls(const CudaLowering& l, const CudaOp& op, const HeadRows& rows);
 
 }  // namespace vla::lower

@@ -11,9 +11,9 @@ namespace {
 
 constexpr double kTera = 1e12, kGiga = 1e9, kMicro = 1e-6;
 
-// Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202 and H100. That mma.sync, which our
-// kernels use, reaches 0.62 of the H100's tensor units, and what launches in graphs take, are from memory of what
-// others report, and never checked.
+// Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202 and H100. Two figures are from memory of
+// published reports and were never checked: mma.sync, which these kernels use, reaches 0.62 of the H100's tensor units;
+// and the time of a launch in a graph.
 constexpr GpuModel kModels[] = {
     {.name = "orin-agx",
      .description = "Jetson AGX Orin 64 GB, 16 SMs at 1.3 GHz",
@@ -62,21 +62,20 @@ constexpr GpuModel kModels[] = {
      .launch = 1.0 * kMicro},
 };
 
-// Assumptions, never measured: issue slots that a quarter of an SM fills where nothing else holds it up; the time of
-// the smallest kernel from its first block to its last, in cycles; how long memory takes to answer.
-// What an SM reads from the second-level cache in a cycle.
+// Assumed, never measured: the fraction of issue slots that a quarter of an SM fills when nothing else stalls it; the
+// cycles of the smallest kernel; the latency of memory; the bytes that an SM reads from the L2 cache per cycle.
 constexpr double kSmBytes = 22;
 constexpr double kIssue = 0.75, kKernelCycles = 4000, kMemoryLatency = 0.8 * kMicro;
 
-/// The main loop of a kernel on tensor cores, whose blocks have a warp or two for each quarter of an SM. The counts are
-/// of machine code for sm_90 (scripts/cuda_kernels.py cubins; tests/cuda/ptx_test.py compares); attention's have the
-/// branch of a mask in them.
+/// The main loop of a tensor-core kernel, whose blocks have one or two warps per quarter of an SM. Instructions are
+/// counted in the machine code for sm_90 (scripts/cuda_kernels.py cubins; tests/cuda/ptx_test.py compares them); those
+/// of attention include the mask's branch.
 struct Loop {
   const char* kernel;
-  int instructions, tensor;  // of a warp in a step
+  int instructions, tensor;  // instructions of a warp per step
   int registers;             // of a thread
-  int step;                  // elements of the depth, or keys
-  int stage, n_stage;        // bytes that a step reads, and steps that there is shared memory for
+  int step;                  // elements of the depth, or keys, per step
+  int stage, n_stage;        // bytes read per step, and steps that fit in shared memory
   int n_warp = 4;            // of a block
 };
 constexpr Loop kLoops[] = {
@@ -101,12 +100,13 @@ const Loop& loop_of(const std::string& kernel) {
   return *std::find_if(std::begin(kLoops), std::end(kLoops), [&](const Loop& loop) { return kernel == loop.kernel; });
 }
 
-/// An operation's cost on a GPU.
+/// The cost of an operation on a GPU.
 struct Cost {
-  double products = 0;  // seconds of all SMs, were they all at work
-  double alone = 0;     // seconds where nothing else runs: whole waves of blocks
+  double products = 0;  // seconds with all SMs busy
+  double alone = 0;     // seconds on an otherwise idle GPU, in whole waves of blocks
   double bytes = 0;
-  double fetch = 0;  // seconds of them where nothing else runs: as much as its blocks ask for at a time
+  // seconds to read memory on an otherwise idle GPU, limited by the bytes that its blocks have in flight
+  double fetch = 0;
   int n_launch = 0;
 };
 
@@ -114,7 +114,7 @@ class Costs {
  public:
   Costs(const CudaLowering& lowering, const GpuModel& model) : l(lowering), gpu(model) {}
 
-  /// `n_launch`: of the kernels that the operation is.
+  /// `n_launch`: the number of kernels of the operation.
   Cost of(const CudaOp& op, int n_launch) const {
     Cost cost;
     cost.n_launch = n_launch;
@@ -126,13 +126,12 @@ class Costs {
   }
 
  private:
-  /// Blocks of equal work in seconds of an SM, which takes them one after the other.
+  /// Time of equal blocks on one SM, which runs them one after the other.
   void add_blocks(Cost& cost, double n_block, double of_block) const {
     cost.products += n_block * of_block / gpu.n_sm;
     cost.alone += std::ceil(n_block / gpu.n_sm) * of_block;
   }
-  /// Blocks of a kernel on tensor cores: each quarter of an SM issues the instructions of its warps, and its tensor
-  /// unit multiplies, side by side.
+  /// Time of tensor-core blocks: each quarter of an SM issues its warps' instructions while its tensor unit multiplies.
   void add_loops(Cost& cost, double n_block, double n_step, const Loop& loop, double rate,
                  double of_instruction) const {
     const double tensor_cycles = of_instruction * 4 * gpu.n_sm * gpu.clock / rate;
@@ -141,7 +140,7 @@ class Costs {
     const int registers = (loop.registers + 7) / 8 * 8 * 32 * loop.n_warp;
     const double most = std::min((64 << 10) / registers, gpu.shared / (loop.n_stage * loop.stage));
     const double at_work = std::min(n_block, gpu.n_sm * most);
-    const double asked = at_work * (loop.n_stage - 1) * loop.stage;  // bytes that are on their way
+    const double asked = at_work * (loop.n_stage - 1) * loop.stage;  // bytes in flight
     cost.fetch = std::max(cost.fetch, cost.bytes / (asked / kMemoryLatency));
   }
   void add_products(Cost& cost, const CudaOp& op, const LinearOp& linear) const {
@@ -155,7 +154,7 @@ class Costs {
       const ProductShape shape = cut.shape;
       const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
-      if (kind == MatrixKind::f32) {  // rows and columns behind the last are multiplied as well
+      if (kind == MatrixKind::f32) {  // padded rows and columns are multiplied, too
         const double padded = tiles * static_cast<double>(size * size) * 2 * static_cast<double>(weight.shape[0]);
         add_blocks(cost, tiles, padded / tiles / (gpu.f32 / gpu.n_sm));
       } else if (const std::int64_t width = strip_width(shape); width > 0) {
@@ -183,7 +182,7 @@ class Costs {
     }
     const AttentionPlan plan = plan_attention(l, attention);
     const Loop& loop = loop_of(plan.shape->kernel);
-    // Scores and weighted values are two multiply-adds for each query, key and element of a head.
+    // Two multiply-adds per query, key and element of a head: scores and weighted values.
     const double n_key = flop_of(*attention.node) / (4.0 * static_cast<double>(count(q)));
     const std::int64_t n_head_kv = l.value(attention.packed[0]).shape[1], n_row = q[1] / n_head_kv * q[2];
     const std::int64_t n_block = (n_row + plan.shape->rows - 1) / plan.shape->rows * n_head_kv * q[3] * op.n_split;
@@ -209,8 +208,8 @@ Result<GpuModel> find_gpu_model(const std::string& name) {
 std::vector<Program::Prediction> predict(const CudaLowering& l, const std::vector<int>& n_launch, const GpuModel& gpu) {
   const Costs costs(l, gpu);
   const std::size_t n_stage = l.graph.stages().size() + 1;
-  std::vector<Program::Prediction> all(n_stage + 1);  // the last is that of `prepare`
-  // Operations of a phase run side by side, and share units and memory.
+  std::vector<Program::Prediction> all(n_stage + 1);  // the last entry is `prepare`
+  // Operations of a phase run concurrently and share units and memory.
   for (std::size_t first = 0, end = 0; first < l.ops.size(); first = end) {
     Cost together;
     double alone = 0, fetch = 0;

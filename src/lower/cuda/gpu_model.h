@@ -8,27 +8,26 @@
 
 namespace vla::lower {
 
-/// A GPU's published figures, without sparsity and at the clock that the maker's peaks are told for: the basis of
-/// predictions for GPUs that are not there.
+/// A GPU's published figures without sparsity, at the clock of the maker's peak figures: the basis of predictions for
+/// GPUs that are not present.
 struct GpuModel {
   const char *name, *description;
   int n_sm;
-  bool is_hopper = false;  // has its own kernels
+  bool is_hopper = false;  // whether Hopper kernels run
   double clock;            // Hz
-  double bf16, int8;  // operations a second of tensor units by our instructions (mma.sync), sums in float32 and int32
-  double f32, dot4;   // of fused multiply-adds of floats, and of four bytes at a time
-  double bandwidth;   // bytes a second
-  int shared;         // bytes of shared memory of an SM
-  double launch;      // seconds between a kernel of a graph and one that waits for it
+  double bf16, int8;       // operations per second of the tensor units by mma.sync, summed in float32 and int32
+  double f32, dot4;        // operations per second of float FMA, and of dp4a
+  double bandwidth;        // bytes a second
+  int shared;              // bytes of shared memory per SM
+  double launch;           // seconds between two dependent kernels of a graph
 };
 
 /// Errors: usage.
 Result<GpuModel> find_gpu_model(const std::string& name);
 
-/// How long the phases of a program take on it: products and attention in whole waves of blocks, by the issue slots or
-/// the tensor time of their main loops, or all operands once over the memory, whichever takes longer; then launches,
-/// and what the smallest kernel takes. Entries as Program::predictions has them. n_launch: of the kernels that each
-/// operation is.
+/// Predicts the time of a program's phases. Products and attention take whole waves of blocks, limited by the issue
+/// slots or tensor time of their main loops, or the time to read all operands once, whichever is longer; launches and
+/// the smallest kernel's time are added. Entries: see Program::predictions. n_launch: kernels per operation.
 std::vector<Program::Prediction> predict(const CudaLowering& l, const std::vector<int>& n_launch, const GpuModel& gpu);
 
 }  // namespace vla::lower

@@ -10,17 +10,17 @@
 namespace vla::lower {
 namespace {
 
-/// What products take, in microseconds.
+/// Cost model of a product, in microseconds and rates per microsecond.
 struct Rates {
-  double sums;           // over 128 bytes of the depth, of a block in a microsecond
-  double of_sm;          // bytes that an SM reads from the second-level cache in a microsecond
-  double least;          // a step of the depth, at least
-  double kernel, block;  // what both take beside
-  double end;            // of each result of a block
-  double finish;         // a kernel that adds shares of the depth, beside its traffic
+  double sums;           // results of a block that take a step of the depth
+  double of_sm;          // bytes that an SM reads from the L2 cache
+  double least;          // least time of a step of the depth
+  double kernel, block;  // fixed costs of the kernel and of a block
+  double end;            // per result of a block
+  double finish;         // fixed cost of the kernel that adds shares of the depth
 };
-// bf16: fitted to 999 products of 50 to 968 rows on an H200, each with float32 results. Codes: of the data sheet, at
-// 0.85 of the tensor units' peak.
+// bf16: fitted to 999 products of 50 to 968 rows on an H200, with float32 results. Codes: from the data sheet, at 0.85
+// of the tensor units' peak.
 constexpr Rates kBf16 = {
     .sums = 38.9e3, .of_sm = 60.8e3, .least = 0.355, .kernel = 1.2, .block = 1.3, .end = 4.4e-5, .finish = 0};
 constexpr Rates kCodes = {.sums = 0.85 * 32 * 1755,

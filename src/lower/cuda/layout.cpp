@@ -14,8 +14,8 @@
 namespace vla::lower {
 namespace {
 
-/// Whether a bf16 product of so many rows is made in strips. For more, tiles of both operands in shared memory are
-/// worth their barriers.
+/// Whether a bf16 product of this many rows uses strips. With more rows, tiles of both operands in shared memory pay
+/// for their barriers.
 bool is_of_strips(std::int64_t n_row, std::int64_t depth) {
   return n_row > cuda::kBf16FewRows && n_row <= 64 && depth % 8 == 0;
 }
@@ -45,7 +45,7 @@ class CudaLayouts final : Layouts {
     meet(step, op.operands());
     l.ops.push_back({std::move(step), std::move(op)});
   }
-  /// Attention reads keys and values where they lie, in the place of what PackOp would write.
+  /// Makes attention read keys and values in place instead of PackOp's result.
   void choose(Step& step, PackOp& op) {
     const bool rounds = rounds_heads(op.rounds, op.k);
     HeadRows v = {op.v};
@@ -53,7 +53,7 @@ class CudaLayouts final : Layouts {
     prepare(step, v, rounds);
     keys_[step.writes[0]] = {op.k.x, v.x};
   }
-  /// x normed and turned, as an operation just before the one at hand; x itself where nothing is done to it.
+  /// Adds an operation that norms and rotates x before the current one; returns x itself if there is neither.
   void prepare(Step& step, HeadRows& rows, bool rounds) {
     meet(step, rows.operands());
     if (rows.norm == nullptr && rows.rope == nullptr && !rounds) return;
@@ -61,7 +61,7 @@ class CudaLayouts final : Layouts {
     l.ops.push_back({{.reads = step.reads, .writes = {to}, .order = step.order}, HeadOp{rows}});
     rows.x = to, rows.norm = rows.rope = nullptr;
   }
-  /// Kernels of bf16 read heads of whole 16 bytes.
+  /// bf16 kernels read heads in whole 16 bytes.
   bool rounds_heads(bool rounds, const HeadRows& rows) const { return rounds && l.value(rows.x).shape[0] % 8 == 0; }
 
   void choose(Step& step, LinearOp& op) {
@@ -83,19 +83,19 @@ class CudaLayouts final : Layouts {
     if (has_gate) made.writes.push_back(made.gate = add_rows(y));
     split(made, cut.n_split, n_column * n_row);
   }
-  /// Whether a block has columns of both matrices of a gated product.
+  /// Whether one block computes columns of both gate and up.
   bool multiplies_both(const LinearOp& op, std::int64_t n_row) const {
     return std::all_of(op.linears.begin(), op.linears.end(), [&](const Node* node) {
       return l.matrix(*node).kind == MatrixKind::bf16 &&
              (is_of_strips(n_row, l.value(op.x).shape[0]) || (l.is_hopper && n_row > 64));
     });
   }
-  /// n: floats that each share of a product or of attention leaves.
+  /// n: floats of each share's partial result.
   void split(CudaOp& op, int n_split, std::int64_t n) {
     op.n_split = n_split;
     if (n_split > 1) op.writes.push_back(op.partial = add_rows({n, n_split, 1, 1}));
   }
-  /// Rounds the result of a product, attention or a window as it is stored, where nobody else reads it.
+  /// Stores the result of a product, attention or window rounded if `reader` is its only reader.
   void round_at_once(CudaOp& round, const RoundOp& what) {
     const Value &x = l.value(what.x), &to = l.value(round.writes[0]);
     const bool is_whole =
@@ -110,8 +110,8 @@ class CudaLayouts final : Layouts {
     maker->writes[0] = round.writes[0];
     round.writes.clear();
   }
-  /// Rounds heads that are neither normed nor turned as the product that makes them is stored, where nobody else reads
-  /// it.
+  /// Stores heads rounded by the product that makes them if they are neither normed nor rotated and have no other
+  /// reader.
   void round_heads_at_once(CudaOp& head, const HeadRows& rows) {
     const Value x = l.value(rows.x);
     const ValueId to = head.writes[0];
@@ -129,7 +129,7 @@ class CudaLayouts final : Layouts {
     l.value(to).base = maker->writes[0];
     head.writes.clear();
   }
-  /// Whether a value or a view of it is told.
+  /// Whether a value or a view of it is tapped.
   bool is_tapped(ValueId base) const {
     return std::any_of(l.values.begin(), l.values.end(), [&](const Value& value) {
       return value.base == base && value.node != nullptr && value.node->tapped;
@@ -156,8 +156,8 @@ std::int64_t blocks_of(std::int64_t n_row, std::int64_t n_column, std::int64_t r
   return (n_row + rows - 1) / rows * ((n_column + columns - 1) / columns);
 }
 
-/// Microseconds of strips, as an H200 took them: a warp waits for each of its steps of the depth, and a kernel that
-/// adds shares takes 2 us, beside the traffic of its sums.
+/// Microseconds of a strip kernel, measured on an H200: a warp waits in each step of the depth; a kernel that adds
+/// shares takes 2 us and the traffic of its sums.
 double strip_us(std::int64_t width, int n_split, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
                 int n_sm) {
   constexpr double kBegin = 2, kOfAll = 2.5e6, kFinish = 2;
@@ -170,7 +170,7 @@ double strip_us(std::int64_t width, int n_split, std::int64_t n_row, std::int64_
   return n_split == 1 ? us : us + kFinish + static_cast<double>(2 * 4 * n_row * n_column * n_split) / kOfAll;
 }
 
-/// The strips, and shares of the depth, that take the shortest time.
+/// The strip width and number of shares with the shortest time.
 ProductCut cut_in_strips(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
   ProductCut best = {ProductShape::strip16, 1, 0, std::numeric_limits<double>::max()};
   for (const ProductShape shape :
@@ -198,7 +198,7 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
   if (is_bf16 && is_of_strips(n_row, depth)) {
     const ProductCut strips = cut_in_strips(n_row, n_column, depth, n_sm);
     if (!has_tiles) return strips;
-    // Strips of q, k and v are one launch; tiles are streams that fork and join.
+    // Strips of q, k and v are one launch; tiles run on forked streams.
     constexpr double kFork = 1;
     const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, is_gated, n_sm);
     return tiles.us + kFork < strips.us ? tiles : strips;
@@ -211,7 +211,7 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
   if (kind == MatrixKind::f32) return {shape, 1};
   std::int64_t n_block = shape == ProductShape::rows128 ? n_large : blocks_of(n_row, n_column, 64, 64);
   if (is_few) n_block = blocks_of(1, n_column, 1, is_bf16 ? 8 : 128);
-  // Shares are of 8 steps or more, and one unless blocks are fewer than run at a time.
+  // A share has 8 steps or more; the depth is split only if there are fewer blocks than run at a time.
   const std::int64_t step = is_bf16 ? cuda::kBf16Depth : cuda::Int8Tile::kDepth;
   const std::int64_t most = std::max<std::int64_t>((depth + step - 1) / step / 8, 1);
   return {shape, static_cast<int>(std::clamp<std::int64_t>(n_sm / std::max<std::int64_t>(n_block, 1), 1, most))};

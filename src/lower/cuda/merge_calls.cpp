@@ -25,7 +25,7 @@ Call call_of(const cuda::Launch& how, const Job& job) {
   return {how, {bytes, bytes + sizeof(job)}};
 }
 
-/// A product in strips of one matrix, whose depth is not split.
+/// Whether an operation is a product of one matrix in strips, without split depth.
 bool is_strip(const Calls& calls) {
   if (calls.size() != 1 || !std::string_view(calls[0].how.kernel).starts_with("linear_strip_")) return false;
   const auto job = job_of<cuda::LinearBf16Job>(calls[0]);
@@ -33,7 +33,7 @@ bool is_strip(const Calls& calls) {
 }
 bool is_heads(const Calls& calls) { return calls.size() == 1 && calls[0].how.kernel == std::string_view("head_rows"); }
 
-/// Merges the operations that `fits` says, up to kMost at a time, with those of them that `agrees` with the first.
+/// Merges operations for which `fits` holds and `agrees` with the first, up to kMost at a time.
 template <class Job, class Fits, class Agrees, class Launch>
 void merge(std::vector<Calls>& phase, Fits fits, Agrees agrees, Launch launch) {
   for (std::size_t first = 0; first < phase.size(); ++first) {
@@ -49,7 +49,7 @@ void merge(std::vector<Calls>& phase, Fits fits, Agrees agrees, Launch launch) {
       phase.erase(phase.begin() + static_cast<std::ptrdiff_t>(i));
     }
     if (several.n == 1) continue;
-    const cuda::Launch how = launch(several);  // which notes where jobs end
+    const cuda::Launch how = launch(several);  // fills in where each job ends
     phase[first] = {call_of(how, several)};
   }
 }

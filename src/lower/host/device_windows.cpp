@@ -9,7 +9,7 @@
 namespace vla::lower {
 namespace {
 
-/// Threads that read what is streamed: a GPU leaves the cores to them, and four are faster than most disks.
+/// Threads that read streamed matrices. A GPU leaves the cores idle, and four threads outrun most disks.
 int n_reader() { return std::clamp(static_cast<int>(kernels::allowed_cores().size()) / 2, 1, 4); }
 
 }  // namespace
@@ -45,7 +45,8 @@ Status DeviceWindows::bring(const Groups& groups) {
   return {};
 }
 
-/// When it returns the host's window is another group's, while the device may still compute with the groups before.
+/// On return the host's window may be overwritten by the next group, while the device still computes with earlier
+/// groups.
 Status DeviceWindows::upload(int group) {
   held(group) = -1;
   VLA_CHECK(stream_->bring(group, group));

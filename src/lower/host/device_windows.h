@@ -11,31 +11,30 @@
 
 namespace vla::lower {
 
-/// Memory of a device for its windows, and of the host for as many, from which the device takes what comes to its own.
+/// The device memory of the windows, and host memory of the same size from which the device copies.
 class WindowMemory {
  public:
   virtual ~WindowMemory() = default;
   virtual std::byte* host(int window) = 0;
-  /// What was asked of the device until now may read this window. Errors: device.
+  /// Notes that all work queued so far may read this window. Errors: device.
   virtual Status note_read(int window) = 0;
-  /// Copies the first bytes of the host's window to the device's, once what may read that has ended, and waits until
-  /// they are there. Errors: device.
+  /// Waits for the work that reads the device's window, copies the first bytes of the host's window to it, and waits
+  /// for the copy. Errors: device.
   virtual Status upload(int window, std::size_t size) = 0;
 };
 
-/// The device's half of matrices that have no place of their own: windows that groups of them come to while the device
-/// computes with others. A WeightStream has the groups ready in the windows of the host. One thread at a time may call
-/// this.
+/// The device's side of weight streaming: groups of matrices are copied into windows of device memory while the device
+/// computes with other groups. A WeightStream fills the host's windows. One thread at a time may call it.
 class DeviceWindows {
  public:
-  /// place_of: how a matrix lies in a window; size_of: bytes from its begin to that of the next. Errors: out_of_memory.
+  /// place_of returns a matrix's layout in a window, size_of its bytes up to the next matrix. Errors: out_of_memory.
   static Result<std::shared_ptr<DeviceWindows>> start(std::unique_ptr<WindowMemory> memory,
                                                       std::shared_ptr<const Content> content, const WeightPlan& plan,
                                                       const std::function<MatrixPlace(const Param&)>& place_of,
                                                       const std::function<std::size_t(const Param&)>& size_of);
 
-  /// Has groups on the device for what is asked of it next, until others are wanted. Errors: bad_bundle where the file
-  /// has not their bytes any more, device.
+  /// Puts groups on the device for the work queued next; they stay until others are requested. Errors: bad_bundle if
+  /// the file no longer has their bytes, device.
   Status bring(const Groups& groups);
 
  private:
@@ -46,9 +45,9 @@ class DeviceWindows {
 
   std::unique_ptr<WindowMemory> memory_;
   std::vector<std::size_t> sizes_;                // of groups
-  std::array<int, WeightStream::kWindows> held_;  // the group in each window of the device, or -1
-  Groups reading_;                                // by what was asked last
-  std::unique_ptr<WeightStream> stream_;          // goes before the memory that it writes to
+  std::array<int, WeightStream::kWindows> held_;  // the group in each of the device's windows, or -1
+  Groups reading_;                                // of the last request
+  std::unique_ptr<WeightStream> stream_;          // destroyed before the memory that it writes to
 };
 
 }  // namespace vla::lower

@@ -10,17 +10,17 @@
 
 namespace vla::lower {
 
-/// Everything that kernels read starts at such a multiple.
+/// Alignment of everything that kernels read, in bytes.
 constexpr std::size_t kAlignment = 64;
 constexpr std::size_t aligned(std::size_t size) { return (size + kAlignment - 1) / kAlignment * kAlignment; }
 
-/// Memory from the system, zeros until it is written, whose pages come when they are touched.
+/// Zeroed memory from the system; pages are allocated when touched.
 class Memory {
  public:
   Memory() = default;
-  /// `what` is for the error. Errors: out_of_memory.
+  /// `what` names the memory in the error. Errors: out_of_memory.
   static Result<Memory> allocate(std::size_t size, const std::string& what);
-  /// Addresses that nobody may write, also of more than the system has. They read as zeros, which take no memory.
+  /// Reserves addresses that read as zeros, may not be written and take no memory, even more than the system has.
   static Result<Memory> reserve(std::size_t size, const std::string& what);
 
   std::byte* data() const { return data_.get(); }

@@ -10,17 +10,17 @@
 namespace vla::lower {
 namespace {
 
-/// Rows of a matrix in a part: whole panels of every kernel.
+/// Rows per part, a multiple of every kernel's panel.
 constexpr std::int64_t kPartRows = 64;
-/// Bytes of a part, at least.
+/// Minimum bytes of a part.
 constexpr std::int64_t kPartSize = 1 << 20;
 
-/// The matrix as it is multiplied.
+/// Size of the matrix as it is multiplied.
 kernels::MatrixDesc desc_of(const Param& matrix, const Encoding& encoding) {
   return {encoding.type, matrix.shape[0], matrix.shape[1]};
 }
 
-/// Those of elements from `first` on, where they are needed: for float32, or beside the packed matrix.
+/// The bundle's scales from element `first` on, if needed: to make float32, or to store beside the packed matrix.
 std::span<const std::byte> scales_of(const Param& matrix, const MatrixPlace& place, std::int64_t first,
                                      std::int64_t count) {
   const Encoding& stored = matrix.encoding;
@@ -30,7 +30,7 @@ std::span<const std::byte> scales_of(const Param& matrix, const MatrixPlace& pla
                                              static_cast<std::size_t>(end - begin) * sizeof(float));
 }
 
-/// A scale a row, where there may be one for all.
+/// Writes one scale per row, repeating the bundle's if it has one for the whole matrix.
 void copy_scales(const float* from, std::size_t n_from, std::int64_t n_row, float* to) {
   for (std::int64_t row = 0; row < n_row; ++row) to[row] = from[n_from > 1 ? row : 0];
 }

@@ -11,49 +11,49 @@
 
 namespace vla::lower {
 
-/// How a kernel wants matrices: bytes of one, and its rows on their way there. Rows from a multiple of 64 on are packed
-/// behind those before.
+/// How a kernel wants matrices: the bytes of one, and a function that packs rows. Rows that start at a multiple of 64
+/// can be packed independently of the rows before.
 struct Packing {
   std::size_t (*size)(const kernels::MatrixDesc& desc) = nullptr;
   void (*pack)(const kernels::MatrixDesc& desc, const std::byte* stored, std::byte* packed) = nullptr;
 };
 
-/// A matrix as it lies in memory, and where.
+/// A matrix's layout and address in memory.
 struct MatrixPlace {
   Encoding encoding;
   Packing packing;
-  std::int64_t n_scale = 0;  // that lie behind it: those of the bundle, or that are made of floats
+  std::int64_t n_scale = 0;  // scales stored after it: the bundle's, or computed from floats
   std::byte* data = nullptr;
-  float* scales = nullptr;  // null where none lie behind it
+  float* scales = nullptr;  // null if it has none
 
-  /// Bytes of the packed matrix `param` with the scales behind it, each aligned.
+  /// Bytes of the packed matrix and its scales, both aligned.
   std::size_t size_of(const Param& param) const;
-  /// Bytes from it to its scales.
+  /// Offset of the scales in bytes.
   std::size_t scales_begin(const Param& param) const;
-  /// The packed matrix goes to `to`, and scales behind it.
+  /// Packs the matrix to `to` and writes its scales after it.
   void put(const Param& param, std::byte* to);
 };
 
-/// Some of a parameter on its way from the bundle's file to its place in memory.
+/// A part of a parameter on its way from the bundle's file to memory.
 struct PackPart {
   std::span<const std::byte> from;
   std::byte* to = nullptr;
   kernels::MatrixDesc desc = {};
   decltype(Packing::pack) pack = nullptr;  // null: a copy
   Recode recode = {};
-  float* scales = nullptr;                      // where they go, one a row
-  std::span<const std::byte> from_scales = {};  // of codes: one a row, or one for all
+  float* scales = nullptr;                      // destination of the scales, one per row
+  std::span<const std::byte> from_scales = {};  // the bundle's scales: one per row, or one in all
 };
 
-/// Cuts a matrix into parts of about a megabyte.
+/// Cuts a matrix into parts of about one megabyte.
 void add_parts(const Param& matrix, const MatrixPlace& place, std::vector<PackPart>& parts);
 
-/// One thread's buffers for reading parts, so that no more than a part for each thread stands in memory twice.
+/// Buffers of one thread that reads parts; at most one part per thread is in memory twice.
 class Packer {
  public:
-  /// Takes the memory that these parts need, since threads must not run out of it. Throws std::bad_alloc.
+  /// Allocates what these parts need, so that threads never run out of memory. Throws std::bad_alloc.
   void reserve(std::span<const PackPart> parts);
-  /// False where the file has not these bytes any more.
+  /// Returns false if the file no longer has these bytes.
   bool run(const Content& content, const PackPart& part);
 
  private:

@@ -8,19 +8,19 @@
 
 namespace vla::lower {
 
-/// Elements of a matrix from the bundle's encoding to that in memory. What encodings there are between the two is known
-/// here alone.
+/// Converts elements of a matrix from the bundle's encoding to the one in memory. The only place that knows which
+/// conversions exist.
 struct Recode {
   Encoding stored, wanted;
 
   bool changes() const { return wanted.type != stored.type; }
-  /// Bytes that `operator()` takes of its buffer.
+  /// Bytes of `buffer` that `operator()` uses.
   std::size_t buffer_size(std::int64_t count) const {
     const std::int64_t row = Int4Block::n_of(wanted.group) * Int4Block::kElements;
     return aligned(wanted.size(count)) + static_cast<std::size_t>(row) * sizeof(float);
   }
-  /// `count` elements, whole groups of them, as they are wanted: in `buffer`, or `from` itself where nothing changes.
-  /// from_scales: those of codes that become floats; scales: room for those that codes get.
+  /// Converts `count` elements (whole groups) into `buffer`, or returns `from` if both encodings are equal.
+  /// from_scales: scales of codes that become floats. scales: receives those of floats that become codes.
   const std::byte* operator()(const std::byte* from, const float* from_scales, std::int64_t count, ReadBuffer& buffer,
                               float* scales) const;
 };

@@ -19,7 +19,7 @@ Result<std::unique_ptr<WeightStream>> WeightStream::start(std::shared_ptr<const 
   return stream;
 }
 
-/// Empty groups fill the last windows of a round, so that every round has its groups in the same ones.
+/// Pads each round with empty groups, so that a group uses the same window in every round.
 WeightStream::WeightStream(std::shared_ptr<const Content> content, std::vector<std::vector<PackPart>> groups)
     : content_(std::move(content)), groups_(std::move(groups)) {
   while (groups_.size() % kWindows != 0) groups_.emplace_back();
@@ -34,7 +34,7 @@ WeightStream::~WeightStream() {
   for (std::thread& thread : threads_) thread.join();
 }
 
-/// A thread's loop: reads one part after the other, as long as there are free windows.
+/// The loop of a reading thread: reads part after part as long as windows are free.
 void WeightStream::serve(Packer packer) {
   Lock lock(mutex_);
   while (true) {
@@ -58,7 +58,7 @@ void WeightStream::serve(Packer packer) {
   }
 }
 
-/// Empty groups are passed on the way.
+/// Skips empty groups.
 bool WeightStream::has_part() {
   if (has_failed_ || moves_) return false;
   for (; reading_ < oldest_ + kWindows; ++reading_) {
@@ -89,7 +89,7 @@ void WeightStream::release(int group) {
   go_to(turn_of(group) + 1, lock);
 }
 
-/// The next one of this group.
+/// The next turn of this group.
 WeightStream::Turn WeightStream::turn_of(int group) const {
   const Turn n = groups_.size();
   return oldest_ + (static_cast<Turn>(group) + n - oldest_ % n) % n;
@@ -101,8 +101,8 @@ bool WeightStream::are_loaded(Turn begin, Turn end) const {
   return true;
 }
 
-/// Frees the windows of what comes before `turn`. Where the threads have not come that far they read on from there, and
-/// none may still write to a window that is freed.
+/// Frees the windows of all turns before `turn`. If the threads are not there yet, they continue from `turn`; waits
+/// until none writes to a window that is being freed.
 void WeightStream::go_to(Turn turn, Lock& lock) {
   if (has_failed_ || !are_loaded(oldest_, turn)) {
     moves_ = true;

@@ -13,17 +13,16 @@
 
 namespace vla::lower {
 
-/// Matrices that have no place of their own in memory. Threads read them from the bundle's file, check and pack them,
-/// group after group and round and round, while programs compute: the groups after the one that is needed stand in
-/// windows, each group always in the same one. So programs find every matrix at an address that never changes, and have
-/// to say when they need it.
+/// Streams matrices that have no memory of their own. While programs compute, threads read groups of matrices from the
+/// bundle's file, check and pack them, cyclically. The next groups stand ready in windows, and a group always uses the
+/// same window. So a matrix has a fixed address, but programs must say when they need it.
 class WeightStream {
  public:
-  /// One that is read, one that is ready and one that is filled.
+  /// One window in use, one ready, one being filled.
   static constexpr int kWindows = 3;
   static int window_of(std::size_t group) { return static_cast<int>(group) % kWindows; }
 
-  /// groups: the parts of each, which go to the group's window. Errors: out_of_memory where the system refuses a
+  /// groups: the parts of each, which are read into the group's window. Errors: out_of_memory if the system refuses a
   /// thread.
   static Result<std::unique_ptr<WeightStream>> start(std::shared_ptr<const Content> content,
                                                      std::vector<std::vector<PackPart>> groups, int n_thread);
@@ -31,16 +30,16 @@ class WeightStream {
   WeightStream& operator=(const WeightStream&) = delete;
   ~WeightStream();
 
-  /// Waits until groups `first` to `last`, at most kWindows, are in memory. They stay there until `release` or until
-  /// others are wanted. Groups are best wanted in their order. Errors: bad_bundle where the file has not their bytes
-  /// any more; whoever asks next has them read again.
+  /// Waits until groups `first` to `last`, at most kWindows, are in memory. They stay until `release` or until others
+  /// are requested. Request groups in their order for speed. Errors: bad_bundle if the file no longer has their bytes;
+  /// the next request reads them again.
   Status bring(int first, int last);
-  /// The group is needed no more in this run: one behind it takes its window.
+  /// The run no longer needs this group; a later group takes its window.
   void release(int group);
 
  private:
   using Lock = std::unique_lock<std::mutex>;
-  /// A group in one of the rounds: of round r group g is r * n_group + g.
+  /// Counts groups over rounds: turn r * n_group + g is group g of round r.
   using Turn = std::uint64_t;
 
   WeightStream(std::shared_ptr<const Content> content, std::vector<std::vector<PackPart>> groups);
@@ -60,11 +59,11 @@ class WeightStream {
 
   std::mutex mutex_;
   std::condition_variable may_read_, has_read_;
-  Turn oldest_ = 0;                    // the first whose window is not free
-  Turn reading_ = 0;                   // whose parts are handed out
+  Turn oldest_ = 0;                    // the first turn whose window is in use
+  Turn reading_ = 0;                   // the turn whose parts are handed out
   std::size_t next_part_ = 0;          // of them
-  std::size_t n_left_[kWindows] = {};  // parts of the turn in this window that are not in memory yet
-  int n_busy_ = 0;                     // threads that have a part
+  std::size_t n_left_[kWindows] = {};  // parts of this window's turn that are not in memory yet
+  int n_busy_ = 0;                     // threads that are reading a part
   bool has_failed_ = false, moves_ = false, stop_ = false;
 };
 

@@ -6,7 +6,7 @@
 
 namespace vla::lower {
 
-/// Rows of queries or keys, and the nodes that were fused to prepare them, or null.
+/// Rows of queries or keys, and the norm and rotation nodes that are fused in (or null).
 struct HeadRows {
   ValueId x;
   const Node *norm = nullptr, *rope = nullptr;
@@ -16,7 +16,7 @@ struct HeadRows {
   std::string text() const { return std::string(norm != nullptr ? "norm " : "") + (rope != nullptr ? "rope " : ""); }
 };
 
-/// Keys and values as attention reads them: once for all attention over them.
+/// Packs keys and values for attention, once for all attention over them.
 struct PackOp {
   HeadRows k;
   ValueId v;
@@ -34,9 +34,9 @@ struct PackOp {
 struct AttentionOp {
   const Node* node;
   HeadRows q;
-  bool rounds;  // to what the device rounds products to; else it is float32
+  bool rounds;  // to the type in which the device computes products; else float32
   ValueId mask = kNone;
-  // Of each segment what PackOp makes, or its keys and values where a target packs none.
+  // For each segment: the result of PackOp, or keys and values by turns if the target packs none.
   std::vector<ValueId> packed = {};
   std::vector<std::int64_t> n_key = {};
 

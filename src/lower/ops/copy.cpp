@@ -5,7 +5,7 @@
 namespace vla::lower {
 namespace {
 
-/// The first operand as it lies, one element after the other.
+/// Copies the whole first operand into contiguous elements.
 CopyOp::Part whole_operand(const Lowering& l, const Node& node) {
   const Value& x = l.value(operand(node, 0));
   return {operand(node, 0), x.shape, x.stride, contiguous_strides(x.shape)};
@@ -26,7 +26,7 @@ CopyOp lowered(const Lowering& l, const Node& node, const op::Concat& concat) {
   return op;
 }
 
-/// Patch (factor R + r, factor C + c) becomes part (r, c) of token (R, C): one copy for each part.
+/// Element (factor R + r, factor C + c) goes to part (r, c) of token (R, C): one copy per part.
 CopyOp lowered(const Lowering& l, const Node& node, const op::PixelShuffle& shuffle) {
   const auto [n_column, factor] = shuffle;
   const Value& x = l.value(operand(node, 0));
@@ -38,13 +38,13 @@ CopyOp lowered(const Lowering& l, const Node& node, const op::PixelShuffle& shuf
   for (int r = 0; r < factor; ++r)
     for (int c = 0; c < factor; ++c) {
       CopyOp::Part& part = op.parts.emplace_back(operand(node, 0), shape, from, to);
-      part.from_offset = (r * n_column + c) * row;  // the part begins at patch (r, c)
+      part.from_offset = (r * n_column + c) * row;  // the part starts at element (r, c)
       part.to_offset = (r * factor + c) * d;
     }
   return op;
 }
 
-/// Pixels of a row of a patch, its rows, channels, then patches by column, row and view.
+/// Dimensions, fastest first: pixels of a patch's row, its rows, channels, then patches by column, row and view.
 CopyOp lowered(const Lowering& l, const Node& node, const op::Patches& patches) {
   const Value& x = l.value(operand(node, 0));
   const std::int64_t size = patches.size, columns = x.shape[0] / size, rows = x.shape[1] / size;

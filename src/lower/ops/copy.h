@@ -6,10 +6,9 @@
 
 namespace vla::lower {
 
-/// Parts of the result from elements that lie elsewhere: concat, pixel_shuffle, patches, and views that must be
-/// contiguous.
+/// Copies parts of the result from elsewhere: concat, pixel_shuffle, patches, and views that must be contiguous.
 struct CopyOp {
-  using Extents = std::array<std::int64_t, 6>;  // sizes and strides, the fastest first
+  using Extents = std::array<std::int64_t, 6>;  // sizes or strides, fastest first
   struct Part {
     /// All elements of a shape.
     Part(ValueId id, const Shape& size, const Shape& step, const Shape& to_step) : from(id) {
@@ -24,7 +23,7 @@ struct CopyOp {
     std::int64_t from_offset = 0, to_offset = 0;
   };
 
-  const Node* node = nullptr;  // whose result it is; none of a copy that a pass adds
+  const Node* node = nullptr;  // the node that it computes; null for a copy that a pass adds
   std::vector<Part> parts;
 
   Operands operands() {
@@ -42,7 +41,7 @@ struct CopyOp {
 CopyOp lowered(const Lowering& l, const Node& node, const op::Concat& concat);
 CopyOp lowered(const Lowering& l, const Node& node, const op::PixelShuffle& shuffle);
 CopyOp lowered(const Lowering& l, const Node& node, const op::Patches& patches);
-// Of what would be views, but must not be.
+// For nodes that would be views, but must be copies.
 CopyOp lowered(const Lowering& l, const Node& node, const op::Slice& slice);
 CopyOp lowered(const Lowering& l, const Node& node, const op::Repeat& repeat);
 CopyOp lowered(const Lowering& l, const Node& node, const op::Reshape& reshape);

@@ -6,13 +6,13 @@
 
 namespace vla::lower {
 
-/// activation(W x + b) * factor + residual, or the ReLU of that, or up to three products of the same
-/// x, or gate and up of a gated MLP.
+/// activation(W x + b) * factor + residual, optionally with a final ReLU; or up to three products of one x; or the gate
+/// and up products of a gated MLP.
 struct LinearOp {
   std::vector<const Node*> linears;
   ValueId x;
-  const Node* norm = nullptr;    // x is what this node normalizes
-  const Node* unfold = nullptr;  // x is what this node moves a window over
+  const Node* norm = nullptr;    // the norm that is applied to x first
+  const Node* unfold = nullptr;  // the window that is moved over x
   ValueId norm_weight = kNone, norm_bias = kNone;
   Activation activation = Activation::none;
   bool gated = false;

@@ -9,7 +9,7 @@ namespace vla::lower {
 /// embedding, gather
 struct LookupOp {
   const Node* node;
-  ValueId ids, table = kNone;  // no table: that of the embedding, a parameter
+  ValueId ids, table = kNone;  // kNone: the table is the embedding's parameter
 
   Operands operands() { return {{ids, Needs::contiguous}, {table, Needs::contiguous}}; }
   std::string text() const { return op_name(node->op) + (" " + path_of(*node)); }

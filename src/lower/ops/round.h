@@ -6,13 +6,13 @@
 
 namespace vla::lower {
 
-/// x, or its norm, as products read it: as codes, as bf16 or as float32. Once for all products of one x.
+/// Converts x, or its norm, to what products read: codes, bf16 or float32. Once for all products of one x.
 struct RoundOp {
-  const Node* product;  // the first of them
+  const Node* product;  // the first product that reads it
   ValueId x;
-  const Node* norm;  // x is what this node normalizes, if any
+  const Node* norm;  // the norm that is applied to x first, or null
   ValueId weight, bias;
-  const char* verb;  // of a printed program
+  const char* verb;  // in a printed program
 
   Operands operands() { return {{x, Needs::even_rows}, {weight, Needs::contiguous}, {bias, Needs::contiguous}}; }
   std::string text() const { return std::string(norm != nullptr ? "norm, " : "") + verb; }

@@ -10,7 +10,7 @@ namespace vla::lower {
 struct WindowOp {
   const Node* node;
   op::Window window;
-  bool takes_largest;  // of the pixels that the window covers; else all of them, or their sum where there are weights
+  bool takes_largest;  // takes the maximum of the covered pixels; else copies them, or sums them with weights
   ValueId x, weight = kNone, bias = kNone;
 
   Operands operands() { return {{x, Needs::contiguous}, {weight, Needs::contiguous}, {bias, Needs::contiguous}}; }

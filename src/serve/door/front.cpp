@@ -21,10 +21,11 @@ using Say = LinkMessage::Kind;
 
 constexpr int kStartPatience = 10'000, kEndPatience = 1'000;  // ms
 constexpr auto kBeat = std::chrono::milliseconds(200);
-constexpr int kMaxStopped = 5, kMaxSilent = 50;  // beats without an answer: of one that is stopped, of any
+// unanswered heartbeats: of a process that is stopped (SIGSTOP), of any process
+constexpr int kMaxStopped = 5, kMaxSilent = 50;
 constexpr auto kFirstDelay = std::chrono::milliseconds(100), kLongestDelay = std::chrono::milliseconds(5'000);
 constexpr auto kStable = std::chrono::seconds(10);
-constexpr std::size_t kEnvelope = 1 << 20;  // what a request may be larger than the message that it was made of
+constexpr std::size_t kEnvelope = 1 << 20;  // bytes by which a request may exceed the message that it was made from
 constexpr std::size_t kMaxKept = 64 << 10;  // bytes of an entry
 
 }  // namespace
@@ -42,7 +43,7 @@ class DoorFront::Request final : public NativeCall {
     free();
     try {
       send(refusal(request_id(), out_of_memory("request")));
-    } catch (const std::exception&) {  // not even for that: the client's patience ends it
+    } catch (const std::exception&) {  // no memory even for an error; the client times out
     }
   }
 
@@ -63,7 +64,7 @@ Result<std::unique_ptr<Front>> DoorFront::open(net::Loop& loop, const ServerOpti
 DoorFront::DoorFront(net::Loop& loop, const ServerOptions& options, const Door& door)
     : loop_(loop), options_(options), door_(door), timer_(loop.context()) {}
 
-/// The process ends where its link does, once it has told its clients.
+/// The process ends when its link closes, after it has told its clients.
 DoorFront::~DoorFront() {
   link_.reset();
   if (process_.is_stopped() || !process_.wait_for(kEndPatience)) process_.kill();
@@ -81,7 +82,8 @@ Status DoorFront::start() {
   return {};
 }
 
-/// Before anything is served: a process that cannot live here is told at once. Its message stays in the socket.
+/// Checks the process before anything is served, so that one that cannot run here is reported at once. Its first
+/// message stays in the socket.
 Status DoorFront::await_ready() {
   pollfd socket{link_->descriptor(), POLLIN, 0};
   const bool has_come = ::poll(&socket, 1, kStartPatience) == 1;
@@ -105,11 +107,11 @@ void DoorFront::begin(Io& io) {
   beat();
 }
 
-/// A process that is stopped, or that answers nothing for long, is ended, and another one takes its connections.
+/// Ends a process that is stopped or has not answered for long; another one takes over.
 void DoorFront::beat() {
   timer_.expires_after(kBeat);
   timer_.async_wait([this](boost::system::error_code cancelled) {
-    if (cancelled || !link_) return;  // a turn that was due when the link broke comes nevertheless
+    if (cancelled || !link_) return;  // a turn that was scheduled before the link closed
     if (++n_silent_ > kMaxSilent || (n_silent_ > kMaxStopped && process_.is_stopped()))
       return fail("it does not answer");
     link_->send(Say::ping);
@@ -126,7 +128,7 @@ void DoorFront::fail(const std::string& why) {
   retry(fmt::format("{}; {}", why, process_.kill()));
 }
 
-/// Starts it again after a moment, which doubles from one end to the next.
+/// Restarts the process after a delay that doubles with each failure in a row.
 void DoorFront::retry(const std::string& why) {
   const auto delay =
       std::min<std::chrono::milliseconds>(kFirstDelay * (1 << std::min(n_failure_++, 10)), kLongestDelay);
@@ -230,7 +232,7 @@ void DoorFront::submit(Client& client, LinkMessage message, const wire::Envelope
   io_->refuse(std::move(job), [] { return Error{Code::unsupported, "request", "an act", "another kind"}; });
 }
 
-/// An act that the process before asked for is nobody's any more.
+/// Drops an act that an earlier process requested.
 void DoorFront::respond(std::uint64_t generation, std::uint64_t connection, const std::string& response) {
   if (link_ && generation == generation_) link_->send(Say::response, connection, {}, response);
 }

@@ -15,15 +15,16 @@
 
 namespace vla::serve {
 
-/// A protocol that a process of its own speaks, because it takes a large library or much of the clients' word: it has
-/// the connections, and asks this server natively. The server has bound the address, so that connections wait where the
-/// process ends; it is started again, and gets back what it wanted kept.
+/// A protocol that runs in a process of its own, because it links a large library or parses much untrusted data. The
+/// process holds the connections and sends native requests to this server. The server binds the address, so that
+/// clients can wait while the process is restarted, and keeps the data that the process wants back after a restart.
 class DoorFront final : public Front, Link::Handler {
  public:
   struct Door {
     const char *program, *option, *name, *scheme;  // vla-door-x, --x, x, x://
     std::string ServerOptions::*address;
-    /// The names that its clients give, for people. Errors: usage where the protocol cannot carry what a policy takes.
+    /// Returns the names that its clients use, for display. Errors: usage if the protocol cannot carry what a policy
+    /// takes.
     Result<std::string> (*check)(const ServerOptions& options, const ServedPolicy& policy);
   };
   /// Binds the address and starts the process. Errors: usage, io, unsupported.
@@ -64,15 +65,16 @@ class DoorFront final : public Front, Link::Handler {
   net::Loop& loop_;
   const ServerOptions options_;
   const Door& door_;
-  std::optional<net::Listener<boost::asio::ip::tcp>> listener_;  // never asked to listen: the process takes from it
+  std::optional<net::Listener<boost::asio::ip::tcp>> listener_;  // bound here; the process accepts from it
   std::string address_, told_, description_;
   Process process_;
   std::optional<Link> link_;
   boost::asio::steady_timer timer_;
   bool is_begun_ = false;
-  int n_silent_ = 0, n_failure_ = 0;  // beats without an answer; ends in a row
+  int n_silent_ = 0, n_failure_ = 0;  // unanswered heartbeats; failures in a row
   Clock::time_point started_ = {};
-  std::uint64_t generation_ = 0, first_ = 0, last_ = 0;  // of connections: before the process's first, its newest
+  // numbers of connections: the last before the current process, and the newest
+  std::uint64_t generation_ = 0, first_ = 0, last_ = 0;
   std::map<std::uint64_t, Client> clients_;
   std::map<std::string, std::string> kept_;
   Io* io_ = nullptr;

@@ -23,7 +23,7 @@ struct Head {
 
 }  // namespace
 
-/// Lives until its last handler was called.
+/// Lives until its last callback has run.
 class Link::Ends : public std::enable_shared_from_this<Link::Ends> {
  public:
   Ends(asio::io_context& context, int descriptor, std::size_t max_bytes)

@@ -12,31 +12,30 @@
 
 namespace vla::serve {
 
-/// A message between the server and the process of a front end.
+/// A message between the server and a front end's process.
 struct LinkMessage {
   enum class Kind : std::uint32_t {
     // From the server:
-    policy,    // text: the lines of --map, bytes: a v1::Description; acts may come from now on
+    policy,    // text: the lines of --map; bytes: a v1::Description; from now on acts may arrive
     response,  // bytes: a v1::Response for the connection
     ping,
     // From the process:
-    ready,    // once it has started
+    ready,    // sent once it has started
     pong,     // to a ping
     opened,   // text: the address of the connection
-    request,  // bytes: a v1::Request of the connection
-    refused,  // a call of the connection that never became a request
-    closed,   // text: why the process ended the connection, in one word, and the detail after a space; or empty
-    // From both: bytes that the process wants back when it is started again, by the key in text; no bytes: not any
-    // more.
+    request,  // bytes: a v1::Request from the connection
+    refused,  // a call of the connection that was refused before it became a request
+    closed,   // text: why the process ended the connection, as one word, a space and details; or empty
+    // In both directions: data that the process wants back after a restart, with its key in text; no bytes: forget it.
     keep
   };
   Kind kind = Kind::ping;
-  std::uint64_t connection = 0;  // the process counts them from 1
+  std::uint64_t connection = 0;  // numbered by the process from 1
   std::string text;
   net::Bytes bytes;
 };
 
-/// An end of the socket between the two. It trusts nobody: lengths are bounded before memory is taken.
+/// One end of the socket between server and process. It trusts neither side: it checks lengths before it allocates.
 class Link {
  public:
   static constexpr std::size_t kMaxText = 64 << 10;
@@ -44,19 +43,19 @@ class Link {
    public:
     virtual ~Handler() = default;
     virtual void came(LinkMessage message) = 0;
-    /// The other end is gone, or sent what is no message. Nothing comes any more.
+    /// The other end is gone or has sent an invalid message. No more messages follow.
     virtual void broke(const std::string& why) = 0;
   };
 
-  /// Takes the descriptor. `max_bytes`: of a message's bytes.
+  /// Takes ownership of the descriptor. `max_bytes` limits a message's bytes.
   Link(boost::asio::io_context& context, int descriptor, std::size_t max_bytes);
   ~Link();
-  /// The handler outlives the link.
+  /// The handler must outlive the link.
   void start(Handler& handler);
   void send(LinkMessage::Kind kind, std::uint64_t connection = 0, const std::string& text = {},
             std::string_view bytes = {});
   int descriptor() const;
-  /// Bytes that have not left yet.
+  /// Bytes that are still queued.
   std::size_t n_queued() const;
 
  private:

@@ -20,7 +20,7 @@ namespace {
 
 namespace fs = std::filesystem;
 
-constexpr int kFirstFree = 16;  // above the numbers that the program gets its descriptors at
+constexpr int kFirstFree = 16;  // higher than the descriptors that the program inherits
 
 struct Descriptor {
   int fd = -1;
@@ -69,7 +69,7 @@ Result<Process> Process::start(const std::string& name, const std::vector<std::s
   posix_spawn_file_actions_init(&actions);
   posix_spawnattr_init(&attributes);
   posix_spawn_file_actions_addopen(&actions, 0, "/dev/null", O_RDONLY, 0);
-  posix_spawn_file_actions_adddup2(&actions, 2, 1);  // what the server prints is its own
+  posix_spawn_file_actions_adddup2(&actions, 2, 1);  // stdout belongs to the server
   posix_spawn_file_actions_adddup2(&actions, link.fd, 3);
   posix_spawn_file_actions_adddup2(&actions, other.fd, 4);
   sigset_t none, every;
@@ -94,7 +94,7 @@ Process& Process::operator=(Process&& other) noexcept {
   return *this;
 }
 
-/// The state follows the name, which is in brackets and may hold anything.
+/// The state follows the name, which is in parentheses and may contain anything.
 bool Process::is_stopped() const {
   std::ifstream file(fmt::format("/proc/{}/stat", pid_));
   std::string line;

@@ -11,12 +11,12 @@
 
 namespace vla::serve {
 
-/// A program that the server starts and ends. It has descriptor 3, an end of a socket to the server, and 4, the one
-/// that is given.
+/// A program that the server starts and ends. It inherits two descriptors: 3, its end of a socket to the server, and 4,
+/// the given one.
 class Process {
  public:
-  /// `name` lies beside this program or in ../libexec/vla. Errors: unsupported where there is none, io where the system
-  /// starts no process.
+  /// Starts `name`, which lies beside this program or in ../libexec/vla. Errors: unsupported if it is missing, io if
+  /// the system starts no process.
   static Result<Process> start(const std::string& name, const std::vector<std::string>& arguments, int descriptor,
                                const char* option);
   Process() = default;
@@ -25,13 +25,13 @@ class Process {
   /// Ends it at once.
   ~Process() { kill(); }
 
-  /// Our end of the socket, which the caller has to close; once.
+  /// Returns our end of the socket, once; the caller must close it.
   int take_socket() { return std::exchange(socket_, -1); }
-  /// Whether somebody has stopped it (SIGSTOP).
+  /// Whether it is stopped (SIGSTOP).
   bool is_stopped() const;
-  /// Waits for its end, so long at most; false where it goes on.
+  /// Waits at most this long for it to end; false if it still runs.
   bool wait_for(int milliseconds);
-  /// Ends it at once. How it had ended, or that it was killed, for people.
+  /// Kills it if it still runs. Returns how it ended, for display.
   std::string kill();
 
  private:

@@ -12,39 +12,39 @@ namespace vla::serve::lerobot {
 
 /// The robot's end of a connection.
 struct Peer {
-  std::uint64_t connection = 0;  // a number that is never given again
+  std::uint64_t connection = 0;  // unique, never reused
   std::string address;           // 127.0.0.1
   Clock::time_point since = {};
 };
 
-/// A call of gRPC that came whole.
+/// A complete gRPC call.
 struct Rpc {
   std::uint64_t id = 0;
   Peer peer;
-  std::string method;   // the last part of its name
-  std::string message;  // of SendObservations the joined data of its pieces; else a serialized message
+  std::string method;   // the last part of its path
+  std::string message;  // SendObservations: the joined data of its pieces; else a serialized message
 };
 
 /// Whoever answers calls.
 class CallHandler {
  public:
   virtual ~CallHandler() = default;
-  /// `answer` or `refuse` ends it, now or later.
+  /// Handles a call; `answer` or `refuse` ends it, now or later.
   virtual void called(Rpc rpc) = 0;
-  /// The client does not wait for it any more.
+  /// The client no longer waits for it.
   virtual void cancelled(std::uint64_t id) = 0;
   virtual void opened(const Peer& peer) = 0;
-  /// Of a connection that was ended here, `why` is one word, as observe/observer.h has them; else empty.
+  /// A connection has ended. `why`: one word of observe/observer.h if it was ended here, else empty.
   virtual void closed(const Peer& peer, const std::string& why, const std::string& detail) = 0;
 };
 
-/// How a call ends. One that has ended gets neither.
+/// Ends calls; each call at most once.
 class Calls {
  public:
   virtual ~Calls() = default;
-  /// With a serialized message.
+  /// Answers with a serialized message.
   virtual void answer(std::uint64_t id, const std::string& message) = 0;
-  /// With gRPC's status for the error.
+  /// Answers with the gRPC status of the error.
   virtual void refuse(std::uint64_t id, const Error& error) noexcept = 0;
 };
 

@@ -25,7 +25,7 @@ namespace {
 constexpr const char* kState = "observation.state";
 constexpr std::string_view kImages = "observation.images.";
 constexpr std::int64_t kMaxTimestep = std::int64_t{1} << 53;
-constexpr std::size_t kMaxComputed = 4096;  // timesteps of a robot that are remembered
+constexpr std::size_t kMaxComputed = 4096;  // timesteps remembered per robot
 
 Error bad(Code code, std::string where, std::string expected, std::string found) {
   return {code, std::move(where), std::move(expected), std::move(found)};

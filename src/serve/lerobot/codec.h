@@ -11,11 +11,11 @@
 
 namespace vla::serve::lerobot {
 
-/// The names of LeRobot: a policy's own, `observation.images.X` and `observation.state`, unless a line gives one of
-/// them another feature. Errors: usage, also for a policy that has not one state.
+/// LeRobot's names for a policy: `observation.images.X` and `observation.state`, unless `given` maps another feature to
+/// one. Errors: usage, also for a policy without exactly one state.
 Result<Names> lerobot_names(Given given, const v1::Description& description);
 
-/// A robot's set-up, sent before its first observation: how its readings become a state, and which cameras it has.
+/// A robot's setup, sent before its first observation: its cameras, and which readings form the state.
 struct Setup {
   struct Camera {
     std::string key;            // in an observation
@@ -23,44 +23,45 @@ struct Setup {
   };
   std::vector<std::string> motors;  // in the order of the state
   std::vector<Camera> cameras;
-  std::int64_t n_action = 0;  // rows of a chunk at most
+  std::int64_t n_action = 0;  // maximum rows of a chunk
 };
-/// A pickled RemotePolicyConfig. The policy that it names is not looked at: the server's own answers. `names` outlives
-/// the set-up. Errors: bad_request; bad_observation with both lists where cameras or the state's width do not fit.
+/// Reads a pickled RemotePolicyConfig. Ignores the policy that it names, since the server serves its own. `names` must
+/// outlive the setup. Errors: bad_request; bad_observation, listing both sides, if the cameras or the state's width do
+/// not match.
 Result<Setup> read_setup(std::span<const std::byte> message, const Names& names, const v1::Description& description);
 
-/// A set-up as bytes that `setup_of` reads again. `names` outlives what is read. Errors: bad_request.
+/// Encodes a setup for `setup_of`. `names` must outlive the decoded one. Errors: bad_request.
 std::string bytes_of(const Setup& setup);
 Result<Setup> setup_of(std::string_view bytes, const Names& names);
 bool is_same(const Setup& a, const Setup& b);
 
-/// What a pickled TimedObservation says before its images and its text are looked at.
+/// The fields of a pickled TimedObservation that are read before its images and text.
 struct Observed {
   std::int64_t timestep = 0;
   double timestamp = 0;  // seconds, by the robot's clock
   bool must_go = false;
-  std::vector<float> state;  // as the robot has it
+  std::vector<float> state;  // in the robot's units
   std::string module;        // of its classes
 };
 /// Errors: bad_request, bad_observation.
 Result<Observed> read_observation(const pickle::Pickle& message, const Setup& setup);
 
-/// The act that it is. `limits`: of the description. Errors: bad_observation, too_large.
+/// Makes the act. `limits`: from the description. Errors: bad_observation, too_large.
 Result<v1::Act> act_of(const pickle::Pickle& message, const Observed& observed, const Setup& setup, const Names& names,
                        const v1::Limits& limits);
 
-/// The pickled list of TimedAction, each with a float32 tensor of torch: row i belongs to the observation's timestep +
-/// i. `period`: seconds between rows.
+/// Encodes a pickled list of TimedAction, each with a float32 torch tensor; row i has the observation's timestep + i.
+/// `period`: seconds between rows.
 std::string encode_actions(const v1::ActionChunk& chunk, const Observed& observed, const Setup& setup,
                            const Names& names, double period);
 
-/// Which observations of a robot are computed: the reference's rules.
+/// Decides which observations of a robot are computed, by the reference's rules.
 class Filter {
  public:
-  /// A robot that begins again; what was last computed is still known.
+  /// The robot starts over; the last computed observation is still known.
   void begin() { computed_.clear(); }
-  /// Whether it is computed: one that must go, the first one, and one whose timestep has no chunk yet and whose state
-  /// is at least 1 away from that of the last one, in the robot's own units.
+  /// Whether an observation is computed: always if it says must_go or is the first; else if its timestep has no chunk
+  /// yet and its state differs by at least 1, in the robot's units, from that of the last computed one.
   bool takes(const Observed& observed) const;
   void computes(const Observed& observed);
 

@@ -26,7 +26,7 @@ Error bad(std::string expected, std::string found) {
   return {Code::bad_request, "pickle", std::move(expected), std::move(found)};
 }
 
-/// The names that stand for data. Both places of NumPy's functions, and of LeRobot's classes, are in use.
+/// The names that stand for data. NumPy's functions and LeRobot's classes appear under old and new modules.
 const std::set<std::string, std::less<>>& known_names() {
   static const std::set<std::string, std::less<>> names = [] {
     std::set<std::string, std::less<>> all = {"numpy.ndarray", "numpy.dtype"};
@@ -46,7 +46,7 @@ Error not_c_order() {
   return error;
 }
 
-/// The array of a dtype, a shape and its elements.
+/// Makes an array of a dtype, a shape and elements.
 Result<serve::Array> make_array(const Value& dtype, const Value& shape, std::string_view elements) {
   const std::string type = std::string(dtype.name.empty() ? "|" : dtype.name) + std::string(dtype.data);
   VLA_TRY(const serve::ElementType element, serve::ElementType::read(type, "pickle"));
@@ -68,7 +68,7 @@ const Value* Value::find(std::string_view key) const {
   return nullptr;
 }
 
-/// The stack machine, with data in place of calls.
+/// A pickle's stack machine that builds data instead of calling functions.
 class Reader {
  public:
   explicit Reader(std::string_view bytes) : left_(bytes) {}
@@ -190,7 +190,7 @@ class Reader {
     left_.remove_prefix(n);
     return {bytes, true};
   }
-  /// A little-endian number of n bytes.
+  /// Reads a little-endian number of n bytes.
   Result<std::uint64_t> number(std::size_t n) {
     const Taken taken = take(n);
     if (!taken.ok()) return bad("a whole message", "one that is cut off");
@@ -228,7 +228,7 @@ class Reader {
     return push({.type = type, .data = taken.bytes});
   }
 
-  /// How many values lie above the last mark, which goes.
+  /// Pops the last mark and returns how many values lie above it.
   Result<std::size_t> marked() {
     if (marks_.empty() || marks_.back() > stack_.size()) return bad("a mark", "none");
     const std::size_t n = stack_.size() - marks_.back();
@@ -240,7 +240,7 @@ class Reader {
     return push_container(type, n);
   }
   Status push_tuple(std::size_t n) { return n_free() < n ? nothing() : push_container(Type::list, n); }
-  /// Values above the last mark.
+  /// Pops the values above the last mark.
   std::size_t n_free() const { return stack_.size() - (marks_.empty() ? 0 : marks_.back()); }
   Status push_container(Type type, std::size_t n) {
     VLA_CHECK(push({.type = type}));
@@ -250,7 +250,7 @@ class Reader {
     stack_.push_back(made);
     return {};
   }
-  /// The n topmost values become items.
+  /// Makes the topmost n values items of the container below them.
   Status move_top(std::size_t n, Value& to) {
     if (to.type == Type::map && n % 2 != 0) return bad("a value for each key", "a key alone");
     to.items.insert(to.items.end(), stack_.end() - static_cast<std::ptrdiff_t>(n), stack_.end());
@@ -305,7 +305,7 @@ class Reader {
     return push_name(module.data, name.data);
   }
 
-  /// An object of a class, made without arguments.
+  /// Pushes an object of a class, constructed without arguments.
   Status make_object() {
     if (n_free() < 2) return nothing();
     const Value &made_of = *stack_[stack_.size() - 2], &arguments = *stack_.back();
@@ -316,7 +316,7 @@ class Reader {
     return push({.type = Type::object, .name = made_of.name});
   }
 
-  /// Pushes what a call of NumPy's functions would make.
+  /// Pushes the result of one of NumPy's functions.
   Status reduce() {
     if (n_free() < 2) return nothing();
     const Value &function = *stack_[stack_.size() - 2], &arguments = *stack_.back();
@@ -352,7 +352,7 @@ class Reader {
     });
   }
 
-  /// The second step of an object, an array or a dtype.
+  /// Sets the state of an object, an array or a dtype: the second step of its construction.
   Status build() {
     if (n_free() < 2) return nothing();
     Value &made = *stack_[stack_.size() - 2], &state = *stack_.back();

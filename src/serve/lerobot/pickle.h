@@ -15,31 +15,31 @@
 
 namespace vla::pickle {
 
-/// A value of a pickle. Text, bytes and elements of arrays stay in the message, which outlives the value.
+/// A value of a pickle. Text, bytes and array elements stay in the message, which must outlive the value.
 struct Value {
   enum class Type { none, boolean, integer, real, text, bytes, list, map, array, object, name, dtype };
 
   Type type = Type::none;
-  std::int64_t integer = 0;  // of a boolean too
-  double real = 0;           // also where it is an integer or a boolean
-  std::string_view data;     // of text and bytes; of a dtype its letters, such as f4
-  std::string_view name;     // of a class or function, and of an object's class: `module.name`; of a dtype its order
+  std::int64_t integer = 0;  // also of a boolean
+  double real = 0;           // also of an integer or boolean
+  std::string_view data;     // text and bytes; of a dtype its letters, such as f4
+  std::string_view name;     // `module.name` of a class or function, or of an object's class; of a dtype its byte order
   std::vector<const Value*>
-      items;  // of a list or tuple; of a map keys and values by turns; an object's map of attributes
-  std::unique_ptr<const serve::Array> array;  // of an array, which comes in two steps: null before the second
+      items;  // of a list or tuple; of a map, keys and values by turns; of an object, its map of attributes
+  std::unique_ptr<const serve::Array> array;  // of an array, which is built in two steps; null before the second
 
   bool is_number() const { return type == Type::boolean || type == Type::integer || type == Type::real; }
-  /// The value at a key that is text; null where there is none or this has no keys.
+  /// Returns the value at a text key; null if the key is missing or this has no keys.
   const Value* find(std::string_view key) const;
 };
 
-constexpr std::size_t kMaxSteps = 1 << 14;               // opcodes of a message
-constexpr std::size_t kMaxMarks = 64;                    // containers that are open at once
-constexpr std::size_t kMaxTexts = 2 * serve::kMostText;  // bytes of all of them: an instruction, and names
+constexpr std::size_t kMaxSteps = 1 << 14;               // opcodes per message
+constexpr std::size_t kMaxMarks = 64;                    // containers open at once
+constexpr std::size_t kMaxTexts = 2 * serve::kMostText;  // bytes of all texts: an instruction, and names
 
-/// A message that Python's pickle wrote, protocol 2 to 5. Nothing of it is executed: names of classes and functions are
-/// compared with the few that LeRobot's clients and NumPy's arrays use, and stand for data. Errors: bad_request for any
-/// other name, with the name, for opcodes that could do anything but make data, and beyond the bounds.
+/// Reads a message of Python's pickle, protocol 2 to 5, without executing anything. Names of classes and functions are
+/// compared with those that LeRobot's clients and NumPy's arrays use, and stand for data. Errors: bad_request for any
+/// other name, for opcodes that do more than build data, and beyond the limits.
 class Pickle {
  public:
   static Result<Pickle> read(std::span<const std::byte> message);
@@ -51,7 +51,7 @@ class Pickle {
   const Value* root_ = nullptr;
 };
 
-/// Writes values of protocol 4 one after the other, as a stack machine reads them.
+/// Writes values of protocol 4 in the order in which a stack machine reads them.
 class Writer {
  public:
   Writer() : out_("\x80\x04") {}

@@ -11,8 +11,9 @@
 namespace vla::serve::lerobot {
 namespace {
 
-constexpr auto kPatience = std::chrono::seconds(2);  // of GetActions without an observation, as the reference's
-constexpr double kRateHz = 30;                       // the reference's, where the bundle says none
+// how long GetActions waits for an observation, as in the reference
+constexpr auto kPatience = std::chrono::seconds(2);
+constexpr double kRateHz = 30;  // the reference's, used if the bundle has none
 
 std::span<const std::byte> bytes_of(const std::string& text) { return std::as_bytes(std::span(text)); }
 
@@ -50,7 +51,7 @@ void Robots::called(Rpc rpc) {
   ask(client);
 }
 
-/// Answers a call that needs no engine, GetActions with nothing yet. An empty message is the serialized Empty.
+/// Answers a call that needs no engine; GetActions gets no actions yet. An empty message is a serialized Empty.
 Result<std::string> Robots::answer_now(Rpc& rpc, Client& client) {
   if (rpc.method == "Ready") {
     client.filter.begin();
@@ -73,7 +74,7 @@ Result<std::string> Robots::answer_now(Rpc& rpc, Client& client) {
   return std::string();
 }
 
-/// A robot whose connection broke comes back on another one, and does not say again what it is.
+/// A robot that reconnects after a broken connection does not send its setup again.
 Status Robots::check_setup(const Rpc& rpc, Client& client) {
   if (client.setup) return {};
   if (Shared setup = setups_.for_return(client.peer.address)) return adopt(client, std::move(setup)), Status();
@@ -107,7 +108,7 @@ Status Robots::observe(const Rpc& rpc, Client& client) {
   return {};
 }
 
-/// One of those whose group holds most is dropped.
+/// Drops one observation of the group that holds most.
 void Robots::bound_seen() {
   for (;;) {
     net::Standings all;

@@ -10,8 +10,8 @@
 
 namespace vla::serve::lerobot {
 
-/// The robots that speak LeRobot's asynchronous inference, one of each connection: what they are, what they saw last,
-/// and who waits for actions. Pickles are read without executing anything, and nothing of them is kept but the act.
+/// The robots that speak LeRobot's asynchronous inference, one per connection: their setups, their newest observations,
+/// and the calls that wait for actions. Reads pickles without executing anything, and keeps only the act.
 class Robots final : public CallHandler {
  public:
   /// The server that computes.
@@ -20,22 +20,22 @@ class Robots final : public CallHandler {
     virtual ~Server() = default;
     virtual void opened(const Peer& peer) = 0;
     virtual void closed(const Peer& peer, const std::string& why, const std::string& detail) = 0;
-    /// A serialized v1::Request; false where too many have not been taken yet.
+    /// Takes a serialized v1::Request; returns false if too many are still queued.
     virtual bool ask(std::uint64_t connection, const std::string& request) = 0;
     /// A call that was refused here.
     virtual void refused(std::uint64_t connection) = 0;
-    /// To be given to `restore` where this process is started again; empty: not any more.
+    /// Keeps data for `restore` after a restart of this process; empty: forget it.
     virtual void keep(const std::string& address, const std::string& bytes) = 0;
   };
   struct Limits {
-    std::size_t observed = 0;   // bytes of observations that nobody asked for yet, of all robots
+    std::size_t observed = 0;   // bytes of unrequested observations, of all robots
     std::size_t message = 0;    // of one
-    std::size_t addresses = 0;  // whose set-ups are remembered
+    std::size_t addresses = 0;  // addresses whose setups are remembered
   };
   Robots(Now now, const Limits& limits, Calls& calls, Server& server)
       : now_(now), limits_(limits), calls_(calls), server_(server), setups_(limits.addresses) {}
 
-  /// The policy that is served; before any call.
+  /// Sets the served policy; call it before any call is handled.
   void serve(Names names, const v1::Description& description);
   void restore(const std::string& address, std::string_view bytes) { setups_.restore(address, bytes, names_, now_()); }
 
@@ -43,7 +43,7 @@ class Robots final : public CallHandler {
   void cancelled(std::uint64_t id) override;
   void opened(const Peer& peer) override { server_.opened(peer); }
   void closed(const Peer& peer, const std::string& why, const std::string& detail) override;
-  /// The server's answer to a request of the connection: a serialized v1::Response.
+  /// Takes the server's answer, a serialized v1::Response, to a request of the connection.
   void answered(std::uint64_t connection, std::span<const std::byte> response);
   /// Once a second.
   void sweep();
@@ -70,9 +70,9 @@ class Robots final : public CallHandler {
     Peer peer;
     Shared setup;
     Filter filter;
-    std::optional<Seen> seen;              // the newest that is to be computed
+    std::optional<Seen> seen;              // the newest observation to compute
     std::deque<Waiting> waiting;           // for actions
-    std::map<std::uint64_t, Asked> asked;  // by the number of the request
+    std::map<std::uint64_t, Asked> asked;  // keyed by request number
     std::uint64_t n_request = 0;
     Clock::time_point used = {};
   };

@@ -12,28 +12,28 @@
 
 namespace vla::serve::lerobot {
 
-/// The set-ups that robots of an address had, for one of them that comes back on another connection and does not say
-/// again what it is. It gets a set-up only where every robot of its address has had the same one and a connection with
-/// it has ended: with two kinds of robots behind an address, one could get the joints of the other.
+/// Remembers the setups of an address, for a robot that reconnects and does not send its setup again. It inherits one
+/// only if all robots of its address had the same setup and a connection with it has ended: with two kinds of robots
+/// behind one address, one could get the other's joints.
 class Setups {
  public:
   using Shared = std::shared_ptr<const Setup>;
-  /// `most`: addresses that are remembered; a new one takes the place of one by to_evict's rules.
+  /// `most`: addresses to remember; a new one replaces one chosen by to_evict.
   explicit Setups(std::size_t most) : most_(most) {}
 
-  /// A connection of the address has this set-up now. Whether that is news about the address.
+  /// A connection of the address now has this setup. Returns whether that changes what is known of the address.
   bool had(const std::string& address, const Shared& setup, Clock::time_point now);
-  /// A connection with a set-up has ended. Also news.
+  /// A connection with a setup has ended. Returns the same.
   bool ended(const std::string& address, Clock::time_point now);
-  /// The set-up for a connection without one; null where there is none, or more than one.
+  /// The setup for a connection without one; null if there is none or several.
   Shared for_return(const std::string& address) const;
-  /// Whether robots of the address have had several.
+  /// Whether robots of the address have had several setups.
   bool is_ambiguous(const std::string& address) const;
 
-  /// What there is to be known about an address, as bytes; none where it is forgotten.
+  /// Encodes what is known of an address; empty if it was forgotten.
   std::string bytes_of(const std::string& address) const;
   void restore(const std::string& address, std::string_view bytes, const Names& names, Clock::time_point now);
-  /// The addresses that were forgotten since the last call.
+  /// Returns the addresses that were forgotten since the last call.
   std::vector<std::string> take_forgotten() { return std::exchange(forgotten_, {}); }
 
  private:

@@ -21,7 +21,7 @@ kernels::RowPrep prep_of(const CpuLowering& l, const HeadRows& rows) {
   return prep;
 }
 
-/// x [d_head, n_head, n_token, n_batch].
+/// Describes x of shape [d_head, n_head, n_token, n_batch] for the kernel.
 kernels::HeadRows head_rows(const CpuLowering& l, ValueId id) {
   const Value &x = l.value(id), &base = l.base(id);
   return {.data = l.address(x.base),

@@ -4,7 +4,7 @@
 
 namespace vla::lower {
 
-/// An item is a group of a view.
+/// One item computes one group of one view.
 CpuRun run_of(const CpuLowering& l, const CpuOp& op, const ChannelOp& at) {
   static_assert(op::ChannelAttention::kMaxGroup <= kernels::kMaxChannels);
   const Shape& shape = at.node->shape;

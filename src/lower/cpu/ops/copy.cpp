@@ -6,7 +6,7 @@
 
 namespace vla::lower {
 
-/// An item is some rows of a part.
+/// One item copies some rows of one part.
 CpuRun run_of(const CpuLowering& l, const CpuOp& op, const CopyOp& copy) {
   struct Part {
     kernels::CopyJob job;

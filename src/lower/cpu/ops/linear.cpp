@@ -30,7 +30,7 @@ kernels::LinearJob job_of(const CpuLowering& l, const CpuOp& op, const LinearOp&
     part.type = l.weights.encoding(product.weight).type;
     part.bias = product.bias != nullptr ? l.weights.floats(product.bias) : nullptr;
     part.d_out = product.weight->shape[1];
-    // A gated MLP has one output, that of its last part, up.
+    // A gated MLP has one output, stored in the part of its up matrix, the last one.
     const ValueId y = op.writes[linear.gated ? 0 : static_cast<std::size_t>(job.n_part - 1)];
     part.y = address(l, y), part.y_type = l.value(y).type;
   }

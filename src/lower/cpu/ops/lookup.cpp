@@ -9,8 +9,8 @@
 namespace vla::lower {
 namespace {
 
-/// Rows of a parameter, widened to float32 where they will lie: a row of two bytes an element fills the second half of
-/// its place first.
+/// Copies rows of a parameter and widens them to float32 in place: a row of two-byte elements is first read into the
+/// second half of its destination.
 std::unique_ptr<Task> embed(const CpuLowering& l, const Param* param, const std::int32_t* ids, float* y, std::int64_t d,
                             std::int64_t n) {
   TableRows* const table = l.weights.rows(param);

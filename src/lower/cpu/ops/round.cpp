@@ -4,7 +4,7 @@
 
 namespace vla::lower {
 
-/// Rows of x as int8 codes with their scales (kernels/quantized.h).
+/// Quantizes rows of x to int8 codes and scales (kernels/quantized.h).
 CpuRun run_of(const CpuLowering& l, const CpuOp& op, const RoundOp& round) {
   const Value& x = l.value(round.x);
   const kernels::LinearKernel& kernel = kernel_of(l, *round.product);

@@ -5,7 +5,7 @@
 namespace vla::lower {
 namespace {
 
-/// Rows of up to two operands through a row kernel; the result is contiguous.
+/// Runs a row kernel on each row of x and of an optional second operand; the result is contiguous.
 struct RowCalls {
   kernels::RowKernel kernel = nullptr;
   const float *x, *w, *b;
@@ -27,7 +27,7 @@ void add_scalar(const float* x, const float*, const float*, float s, float* y, s
   for (std::int64_t i = 0; i < n; ++i) y[i] = x[i] + s;
 }
 
-/// Chooses the kernel, and how it takes its second operand.
+/// Selects the kernel, and how it reads the second operand.
 struct SetRowKernel {
   const CpuLowering& l;
   const Value* w;

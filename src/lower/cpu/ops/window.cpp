@@ -4,7 +4,8 @@
 
 namespace vla::lower {
 
-/// Copies the elements that a window covers, or their largest, or their weighted sum; an item is a row of places.
+/// Copies the elements under a window, or takes their maximum, or their weighted sum. One item computes one row of
+/// places.
 CpuRun run_of(const CpuLowering& l, const CpuOp& op, const WindowOp& at) {
   const Shape& places = at.node->shape;
   const kernels::Window window = window_of(at.node->in[0].shape(), at.window, places);
