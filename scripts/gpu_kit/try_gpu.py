@@ -37,7 +37,7 @@ KIT = Path(__file__).resolve().parent
 VLA, TINY = KIT / "bin/vla", KIT / "tiny/policy.gguf"
 # Of the largest action: sums in another order; bf16 beside float32; int8, where what lies between products is rounded in other places.
 TOLERANCE = {"float32": 1e-4, "bf16": 3e-2, "int8": 1e-1}
-MODELS = {"H100": "h100", "5090": "rtx-5090", "3060": "rtx-3060", "Orin": "orin-agx"}  # in a card's name: vla bench --model
+MODELS = {"H100": "h100", "H200": "h200", "5090": "rtx-5090", "3060": "rtx-3060", "Orin": "orin-agx"}  # in a card's name: vla bench --model
 
 
 class Failed(Exception):

@@ -163,7 +163,7 @@ Command add_bench(CLI::App& app) {
   add_text(
       *command, "--model", options->model, "NAME",
       "With --device cuda: run nothing, and print what counts and published rates predict for a GPU that need not be "
-      "there: orin-agx, rtx-3060, rtx-5090 or h100");
+      "there: orin-agx, rtx-3060, rtx-5090, h100 or h200");
   add_text(*command, "--embodiment", options->embodiment, "TAG", kEmbodimentHelp);
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_flag("--markdown", options->markdown, "Print a table for a document");

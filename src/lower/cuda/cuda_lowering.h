@@ -18,11 +18,36 @@ struct HeadOp {
   double flop() const { return 0; }
 };
 
+/// How a product is cut into blocks: tiles of 128 or 64 rows; for few rows a shape bound by reading the matrix; strips
+/// of some columns of up to 64 rows; or a Hopper tile. Also into how many shares the depth is split.
+enum class ProductShape { few, strip16, strip32, strip64, strip128, rows64, rows128, hopper };
+/// Columns of a strip; 0 for other shapes.
+constexpr std::int64_t strip_width(ProductShape shape) {
+  return shape == ProductShape::strip16    ? 16
+         : shape == ProductShape::strip32  ? 32
+         : shape == ProductShape::strip64  ? 64
+         : shape == ProductShape::strip128 ? 128
+                                           : 0;
+}
+struct ProductCut {
+  ProductShape shape = ProductShape::few;
+  int n_split = 1;       // shares of the depth, each with its own blocks
+  std::size_t tile = 0;  // index into kHopperTiles or kHopperInt8Tiles
+  double us = 0;         // estimated time on Hopper
+};
+/// How attention is cut into blocks of query rows and shares of the keys.
+struct AttentionPlan {
+  const cuda::AttentionShape* shape = nullptr;  // null: no tensor cores
+  int n_split = 1;                              // shares of the keys, each with its own blocks
+  double us = 0;                                // estimated time on Hopper, on tensor cores
+};
+
 struct CudaOp : Step {
   AnyOp<HeadOp> op;
+  ProductCut cut = {};      // of a LinearOp
+  AttentionPlan plan = {};  // of an AttentionOp
   ValueId gate = kNone;     // the gate product's result, if no kernel computes gate and up together
-  int n_split = 1;          // shares of the depth (product) or keys (attention), each with its own blocks
-  ValueId partial = kNone;  // the shares' partial results
+  ValueId partial = kNone;  // partial results of the shares of the depth or of the keys
 };
 
 struct CudaLowering : Lowering {
@@ -53,23 +78,6 @@ struct CudaLowering : Lowering {
 /// only such readers is stored rounded. Also splits the depth of products.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 
-/// How a product is cut into blocks: tiles of 128 or 64 rows; for few rows a shape bound by reading the matrix; strips
-/// of some columns of up to 64 rows; or a Hopper tile. Also into how many shares the depth is split.
-enum class ProductShape { few, strip16, strip32, strip64, strip128, rows64, rows128, hopper };
-/// Columns of a strip; 0 for other shapes.
-constexpr std::int64_t strip_width(ProductShape shape) {
-  return shape == ProductShape::strip16    ? 16
-         : shape == ProductShape::strip32  ? 32
-         : shape == ProductShape::strip64  ? 64
-         : shape == ProductShape::strip128 ? 128
-                                           : 0;
-}
-struct ProductCut {
-  ProductShape shape;
-  int n_split;
-  std::size_t tile = 0;  // index into kHopperTiles or kHopperInt8Tiles
-  double us = 0;         // estimated time on Hopper
-};
 /// The strip width, 16 to 64, for several products in one launch without split depth.
 unsigned common_width(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
 /// The Hopper tile with the shortest estimated time.
@@ -79,11 +87,6 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
 ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
                        std::int64_t depth, bool is_gated);
 
-/// How attention is cut into blocks of query rows and shares of the keys.
-struct AttentionPlan {
-  const cuda::AttentionShape* shape;  // null: no tensor cores
-  int n_split;
-};
 /// The tensor-core plan with the shortest estimated time. n_row: query rows of each of the n_unit key heads of a batch.
 AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key,
                              int n_sm);

@@ -11,9 +11,9 @@ namespace {
 
 constexpr double kTera = 1e12, kGiga = 1e9, kMicro = 1e-6;
 
-// Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202 and H100. Two figures are from memory of
-// published reports and were never checked: mma.sync, which these kernels use, reaches 0.62 of the H100's tensor units;
-// and the time of a launch in a graph.
+// Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202, H100 and H200. Two figures are from memory
+// of published reports and were never checked: mma.sync reaches 0.62 of the H100's tensor units; and the time of a
+// launch in a graph, but for Hopper's: of small kernels of acts on an H200, begun before the kernel before them ends.
 constexpr GpuModel kModels[] = {
     {.name = "orin-agx",
      .description = "Jetson AGX Orin 64 GB, 16 SMs at 1.3 GHz",
@@ -59,11 +59,24 @@ constexpr GpuModel kModels[] = {
      .dot4 = 133.8 * kTera,
      .bandwidth = 3350 * kGiga,
      .shared = 228 << 10,
-     .launch = 1.0 * kMicro},
+     .launch = 2.5 * kMicro},
+    {.name = "h200",
+     .description = "H200 SXM 141 GB, 132 SMs at 1.83 GHz",
+     .n_sm = 132,
+     .is_hopper = true,
+     .clock = 1.83 * kGiga,
+     .bf16 = 0.62 * 989 * kTera,
+     .int8 = 0.62 * 1979 * kTera,
+     .f32 = 66.9 * kTera,
+     .dot4 = 133.8 * kTera,
+     .bandwidth = 4800 * kGiga,
+     .shared = 228 << 10,
+     .launch = 2.5 * kMicro},
 };
 
-// Assumed, never measured: the fraction of issue slots that a quarter of an SM fills when nothing else stalls it; the
-// cycles of the smallest kernel; the latency of memory; the bytes that an SM reads from the L2 cache per cycle.
+// Of other GPUs, assumed and never measured: the fraction of issue slots that a quarter of an SM fills when nothing
+// else stalls it; the cycles of the smallest kernel; the latency of memory; the bytes that an SM reads from the L2
+// cache per cycle.
 constexpr double kSmBytes = 22;
 constexpr double kIssue = 0.75, kKernelCycles = 4000, kMemoryLatency = 0.8 * kMicro;
 
@@ -107,7 +120,7 @@ struct Cost {
   double bytes = 0;
   // seconds to read memory on an otherwise idle GPU, limited by the bytes that its blocks have in flight
   double fetch = 0;
-  int n_launch = 0;
+  int n_launch = 0;  // whose time is not in `alone` yet
 };
 
 class Costs {
@@ -126,6 +139,11 @@ class Costs {
   }
 
  private:
+  /// Time of kernels on Hopper as they were measured, from launch to end.
+  static void add_measured(Cost& cost, double us) {
+    cost.products += us * kMicro, cost.alone += us * kMicro;
+    cost.n_launch = 0;
+  }
   /// Time of equal blocks on one SM, which runs them one after the other.
   void add_blocks(Cost& cost, double n_block, double of_block) const {
     cost.products += n_block * of_block / gpu.n_sm;
@@ -149,27 +167,26 @@ class Costs {
       const MatrixKind kind = l.matrix(*node).kind;
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
       const bool has_codes = kind == MatrixKind::ternary || kind == MatrixKind::int8;
-      const bool is_one = linear.gated && op.gate == kNone;
-      const ProductCut cut = cut_product(l, kind, rows, is_one ? 2 * columns : columns, weight.shape[0], is_one);
-      const ProductShape shape = cut.shape;
+      const auto [shape, n_split, tile, us] = op.cut;
       const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
       if (kind == MatrixKind::f32) {  // padded rows and columns are multiplied, too
         const double padded = tiles * static_cast<double>(size * size) * 2 * static_cast<double>(weight.shape[0]);
         add_blocks(cost, tiles, padded / tiles / (gpu.f32 / gpu.n_sm));
+      } else if (gpu.is_hopper && us > 0) {
+        const bool is_one = linear.gated && op.gate == kNone;  // `us` is that of gate and up together
+        add_measured(cost, us / (is_one ? 2 : 1));
       } else if (const std::int64_t width = strip_width(shape); width > 0) {
-        const std::int64_t n_block = (columns + width - 1) / width * ((rows + 63) / 64) * op.n_split;
-        const std::int64_t bytes = (std::min<std::int64_t>(rows, 64) + width) * weight.shape[0] * 2 / op.n_split;
+        const std::int64_t n_block = (columns + width - 1) / width * ((rows + 63) / 64) * n_split;
+        const std::int64_t bytes = (std::min<std::int64_t>(rows, 64) + width) * weight.shape[0] * 2 / n_split;
         add_blocks(cost, static_cast<double>(n_block), static_cast<double>(bytes) / (kSmBytes * gpu.clock));
-      } else if (shape == ProductShape::hopper) {
-        add_blocks(cost, gpu.n_sm, cut.us * kMicro);
       } else if (shape == ProductShape::few) {
         add_blocks(cost, gpu.n_sm, flop_of(*node) / (has_codes ? gpu.dot4 : gpu.f32));
       } else {
         const char* name = kind == MatrixKind::bf16 ? "bf16" : kind == MatrixKind::int8 ? "int8" : "ternary";
         const Loop& loop = loop_of(std::string("linear_") + name + (size == 128 ? "_128" : "_64"));
-        const double n_step = std::ceil(static_cast<double>(weight.shape[0]) / loop.step / op.n_split);
-        add_loops(cost, tiles * op.n_split, n_step, loop, has_codes ? gpu.int8 : gpu.bf16,
+        const double n_step = std::ceil(static_cast<double>(weight.shape[0]) / loop.step / n_split);
+        add_loops(cost, tiles * n_split, n_step, loop, has_codes ? gpu.int8 : gpu.bf16,
                   2 * 16 * 8 * (has_codes ? 32 : 16));
       }
     }
@@ -177,16 +194,17 @@ class Costs {
   void add_attention(Cost& cost, const CudaOp& op, const AttentionOp& attention) const {
     const Shape& q = l.value(attention.q.x).shape;
     if (!attention.rounds) {
-      const double n_block = static_cast<double>((q[2] + 7) / 8 * q[1] * q[3]) * op.n_split;
+      const double n_block = static_cast<double>((q[2] + 7) / 8 * q[1] * q[3]) * op.plan.n_split;
       return add_blocks(cost, n_block, flop_of(*attention.node) / n_block / (gpu.f32 / gpu.n_sm));
     }
-    const AttentionPlan plan = plan_attention(l, attention);
+    const AttentionPlan& plan = op.plan;
+    if (gpu.is_hopper) return add_measured(cost, plan.us);
     const Loop& loop = loop_of(plan.shape->kernel);
     // Two multiply-adds per query, key and element of a head: scores and weighted values.
     const double n_key = flop_of(*attention.node) / (4.0 * static_cast<double>(count(q)));
     const std::int64_t n_head_kv = l.value(attention.packed[0]).shape[1], n_row = q[1] / n_head_kv * q[2];
-    const std::int64_t n_block = (n_row + plan.shape->rows - 1) / plan.shape->rows * n_head_kv * q[3] * op.n_split;
-    add_loops(cost, static_cast<double>(n_block), std::ceil(n_key / loop.step / op.n_split), loop, gpu.bf16,
+    const std::int64_t n_block = (n_row + plan.shape->rows - 1) / plan.shape->rows * n_head_kv * q[3] * op.plan.n_split;
+    add_loops(cost, static_cast<double>(n_block), std::ceil(n_key / loop.step / op.plan.n_split), loop, gpu.bf16,
               2 * 16 * 8 * 16);
   }
 
@@ -218,13 +236,14 @@ std::vector<Program::Prediction> predict(const CudaLowering& l, const std::vecto
       const Cost cost = costs.of(l.ops[end], n_launch[end]);
       together.products += cost.products, together.bytes += cost.bytes;
       alone = std::max(alone, cost.alone), fetch = std::max(fetch, cost.fetch);
-      longest = std::max(longest, cost.n_launch), n_kernel += cost.n_launch;
+      longest = std::max(longest, cost.n_launch), n_kernel += n_launch[end];
     }
     const bool is_prepared = l.ops[first].phase < l.n_prepare;
     Program::Prediction prediction;
     prediction.products = std::max(together.products, alone);
     prediction.bytes = std::max(together.bytes / gpu.bandwidth, fetch);
-    prediction.launches = longest * (gpu.launch + kKernelCycles / gpu.clock), prediction.n_launch = n_kernel;
+    prediction.launches = longest * (gpu.launch + (gpu.is_hopper ? 0 : kKernelCycles / gpu.clock));
+    prediction.n_launch = n_kernel;
     prediction.seconds = std::max(prediction.products, prediction.bytes) + prediction.launches;
     all[is_prepared ? n_stage : stage_of(l, l.ops[first])] += prediction;
   }

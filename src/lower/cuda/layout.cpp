@@ -79,7 +79,7 @@ class CudaLayouts final : Layouts {
       round(step, op, DType::f32, depth, "round");
     meet(step, op.operands());
     const bool has_gate = op.gated && !is_one;
-    CudaOp& made = l.ops.emplace_back(CudaOp{std::move(step), std::move(op)});
+    CudaOp& made = l.ops.emplace_back(CudaOp{std::move(step), std::move(op), cut});
     if (has_gate) made.writes.push_back(made.gate = add_rows(y));
     split(made, cut.n_split, n_column * n_row);
   }
@@ -92,7 +92,6 @@ class CudaLayouts final : Layouts {
   }
   /// n: floats of each share's partial result.
   void split(CudaOp& op, int n_split, std::int64_t n) {
-    op.n_split = n_split;
     if (n_split > 1) op.writes.push_back(op.partial = add_rows({n, n_split, 1, 1}));
   }
   /// Stores the result of a product, attention or window rounded if `reader` is its only reader.
@@ -143,8 +142,9 @@ class CudaLayouts final : Layouts {
     op.packed = std::move(keys);
     meet(step, op.operands());
     const Shape q = l.value(op.q.x).shape;
-    const int n_split = plan_attention(l, op).n_split;
-    split(l.ops.emplace_back(CudaOp{std::move(step), std::move(op)}), n_split, (q[0] + 2) * q[1] * q[2] * q[3]);
+    const AttentionPlan plan = plan_attention(l, op);
+    CudaOp& made = l.ops.emplace_back(CudaOp{std::move(step), std::move(op), {}, plan});
+    split(made, plan.n_split, (q[0] + 2) * q[1] * q[2] * q[3]);
   }
 
   CudaLowering& l;

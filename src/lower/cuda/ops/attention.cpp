@@ -28,10 +28,9 @@ Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const AttentionO
   job.scale = 1 / std::sqrt(static_cast<float>(q.shape[0]));
   job.d_head = narrow(q.shape[0]), job.n_head = narrow(q.shape[1]), job.n_query = narrow(q.shape[2]);
   job.n_batch = narrow(q.shape[3]), job.n_head_kv = narrow(l.value(attention.packed[0]).shape[1]);
-  job.n_split = op.n_split, job.partial = l.at(op.partial), job.is_bf16 = l.value(op.writes[0]).type == DType::bf16;
-  Calls calls = {
-      call(attention.rounds ? cuda::attention_bf16(*plan_attention(l, attention).shape, job) : cuda::attention_f32(job),
-           job)};
+  job.n_split = op.plan.n_split, job.partial = l.at(op.partial),
+  job.is_bf16 = l.value(op.writes[0]).type == DType::bf16;
+  Calls calls = {call(attention.rounds ? cuda::attention_bf16(*op.plan.shape, job) : cuda::attention_f32(job), job)};
   if (job.n_split > 1) calls.push_back(call(cuda::finish_attention(job), job));
   return calls;
 }

@@ -40,8 +40,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                  const cuda::Epilogue& end, const op::Linear* gate, Calls& calls) {
   const Value& x = l.value(of);
   const int rows = narrow(rows_of(x.shape)), columns = narrow(weight.shape[1]), depth = narrow(x.shape[0]);
-  const auto [shape, n_split, tile, us] =
-      cut_product(l, matrix.kind, rows, gate ? 2 * columns : columns, depth, gate != nullptr);
+  const auto [shape, n_split, tile, us] = op.cut;
   switch (matrix.kind) {
     case MatrixKind::f32: {
       const cuda::LinearF32Job job = {.x = l.at(of),
@@ -62,7 +61,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .n_row = rows,
                                        .n_column = columns,
                                        .depth = depth,
-                                       .n_split = op.n_split,
+                                       .n_split = n_split,
                                        .partial = l.at(op.partial),
                                        .end = end,
                                        .gate_weight = gate ? l.param<std::uint16_t>(gate->weight) : nullptr,
@@ -82,7 +81,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .n_row = rows,
                                        .n_column = columns,
                                        .depth = narrow(kernels::quantized_depth(depth)),
-                                       .n_split = op.n_split,
+                                       .n_split = n_split,
                                        .partial = l.at<int>(op.partial),
                                        .end = end};
       const auto kind = matrix.kind == MatrixKind::ternary ? cuda::CodeKind::ternary : cuda::CodeKind::int8;
