@@ -116,10 +116,31 @@ TEST_CASE("attention of few queries fills a device, and of many takes the keys o
     CHECK(plan.n_split <= vla::cuda::kMaxAttentionSplit);
     return (n_row + plan.shape->rows - 1) / plan.shape->rows * n_unit * plan.n_split;
   };
-  CHECK(blocks(256, 400, 1, 610, 132) >= 100);  // a step of an action expert with one head of keys
-  CHECK(blocks(256, 400, 1, 610, 132) <= 132);
-  CHECK(lower::plan_attention(64, 150, 5, 227, 132).n_split == 1);  // keys of one tile
-  CHECK(lower::plan_attention(64, 1024, 24, 1024, 132).shape->key_groups == 1);
-  CHECK(lower::plan_attention(64, 1024, 24, 1024, 132).n_split == 1);
   CHECK(blocks(72, 16, 1, 1 << 16, 132) >= 8);
+}
+
+TEST_CASE("attention takes the shape and the shares that were fastest on an H200, or within a tenth of it") {
+  struct Size {
+    std::int64_t d_head, n_row, n_unit, n_key;
+    std::vector<std::pair<std::string, int>> fast;
+  };
+  const Size sizes[] = {
+      {48, 41, 32, 41, {{"attention_bf16_64_16", 1}, {"attention_bf16_64", 1}}},          // GR00T N1.7, self
+      {48, 41, 32, 200, {{"attention_bf16_64_16", 1}}},                                   // GR00T N1.7, cross
+      {128, 388, 8, 194, {{"attention_bf16_128_32", 1}, {"attention_bf16_128_16", 1}}},   // GR00T N1.7, language
+      {64, 256, 32, 256, {{"attention_bf16_64", 1}, {"attention_bf16_64_32", 1}}},        // GR00T N1.7, vision
+      {256, 400, 1, 610, {{"attention_bf16_256_32", 5}, {"attention_bf16_256_32", 10}}},  // pi0.5, step
+      {256, 4480, 1, 560, {{"attention_bf16_256_32", 1}, {"attention_bf16_256", 1}}},     // pi0.5, prefix
+      {72, 256, 32, 256, {{"attention_bf16_80", 1}}},                                     // pi0.5 and BitVLA, vision
+      {64, 150, 5, 227, {{"attention_bf16_64_16", 1}}},                                   // SmolVLA, step
+      {64, 531, 5, 177, {{"attention_bf16_64_32", 1}, {"attention_bf16_64_16", 1}}},      // SmolVLA, prefix
+      {64, 1024, 24, 1024, {{"attention_bf16_64", 1}}},                                   // SmolVLA, vision
+      {128, 2568, 5, 642, {{"attention_bf16_128", 1}}},                                   // BitVLA, language
+  };
+  for (const Size& size : sizes) {
+    const lower::AttentionPlan plan = lower::plan_attention(size.d_head, size.n_row, size.n_unit, size.n_key, 132);
+    INFO(size.d_head, " of a head, ", size.n_key, " keys: ", plan.shape->kernel, ", shares ", plan.n_split);
+    CHECK(std::find(size.fast.begin(), size.fast.end(),
+                    std::pair<std::string, int>(plan.shape->kernel, plan.n_split)) != size.fast.end());
+  }
 }
