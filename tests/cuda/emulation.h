@@ -208,6 +208,7 @@ T shuffle_xor(T value, int mask) {
 inline float multiply(float a, float b) { return a * b; }
 inline float add(float a, float b) { return a + b; }
 inline float divide(float a, float b) { return a / b; }
+inline float multiply_add(float a, float b, float c) { return std::fma(a, b, c); }
 inline int bits_of(float x) { return std::bit_cast<int>(x); }
 inline float float_of(int bits) { return std::bit_cast<float>(bits); }
 inline unsigned to_bf16(float low, float high) {

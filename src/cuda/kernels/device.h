@@ -119,6 +119,7 @@ VLA_DEVICE T shuffle(T value, int lane) {
 VLA_DEVICE float multiply(float a, float b) { return __fmul_rn(a, b); }
 VLA_DEVICE float add(float a, float b) { return __fadd_rn(a, b); }
 VLA_DEVICE float divide(float a, float b) { return __fdiv_rn(a, b); }
+VLA_DEVICE float multiply_add(float a, float b, float c) { return __fmaf_rn(a, b, c); }
 VLA_DEVICE int bits_of(float x) { return __float_as_int(x); }
 VLA_DEVICE float float_of(int bits) { return __int_as_float(bits); }
 /// Two values rounded to bf16, the first in the lower half.

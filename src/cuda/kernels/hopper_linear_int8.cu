@@ -129,20 +129,26 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   End::place(sum, shared);
   __syncthreads();
   const End end(job, nullptr, row0, column0);
-  const auto of_row = [&](int row) { return RowScale(job, row); };
   // Ternary codes are stored plus 1: the first share of the depth subtracts what that adds.
-  const auto exact = [&](const RowScale& of, unsigned bits) {
-    return static_cast<int>(bits) - (T::kKind == CodeKind::ternary && z == 0 ? of.sum : 0);
+  const auto exact = [&](int sum_of_row, unsigned bits) {
+    return static_cast<int>(bits) - (T::kKind == CodeKind::ternary && z == 0 ? sum_of_row : 0);
   };
   if (job.n_split > 1)
-    return end.leave(shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_column, of_row,
-                     [&](const RowScale& of, unsigned bits) { return static_cast<unsigned>(exact(of, bits)); });
+    return end.leave(
+        shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_column,
+        [&](int row) { return RowScale(job, row); },
+        [&](const RowScale& of, unsigned bits) { return static_cast<unsigned>(exact(of.sum, bits)); });
   const int column = column0 + thread_index() % (T::kColumns / 4) * 4;
   float scale[4];
+  bool are_plain = true;
 #pragma unroll
-  for (int c = 0; c < 4; ++c) scale[c] = column + c < job.n_column ? job.scale[column + c] : 0;
-  end.finish(shared, of_row,
-             [&](const RowScale& of, unsigned bits, int c) { return of.scaled(exact(of, bits), scale[c]); });
+  for (int c = 0; c < 4; ++c) {
+    scale[c] = column + c < job.n_column ? job.scale[column + c] : 0;
+    are_plain = are_plain && (scale[c] == 0 || is_plain(scale[c]));
+  }
+  end.finish(
+      shared, [&](int row) { return RowRatios(job, row, scale, are_plain); },
+      [&](const RowRatios& of, unsigned bits, int c) { return of.scaled(exact(of.sum, bits), c); });
 }
 
 }  // namespace

@@ -21,4 +21,38 @@ struct RowScale {
   }
 };
 
+/// Whether a number is far enough from the ends of the exponents for `quotient`.
+VLA_DEVICE bool is_plain(float x) {
+  constexpr unsigned kLeast = 127 - 40, kRange = 80;
+  return (static_cast<unsigned>(dev::bits_of(x)) >> 23 & 255) - kLeast <= kRange;
+}
+/// a / b as a division rounds it, of plain numbers (a may be 0) and the reciprocal of b as a division rounds that.
+/// After the first correction the quotient is one of the two floats around a / b; a fused remainder is exact and a
+/// further correction then rounds right (P. Markstein, IBM Journal of Research and Development 34, 1990). Unlike a
+/// division it has no branch, of which an epilogue of a division for each sum spent most of its time.
+VLA_DEVICE float quotient(float a, float b, float reciprocal) {
+  float q = dev::multiply(a, reciprocal);
+  q = dev::multiply_add(dev::multiply_add(-b, q, a), reciprocal, q);
+  return dev::multiply_add(dev::multiply_add(-b, q, a), reciprocal, q);
+}
+
+/// The scales of four columns, each divided by a row's, and the sum of the row's codes.
+struct RowRatios {
+  float of[4] = {};
+  int sum = 0;
+  RowRatios() = default;
+  /// are_plain: every scale of a column is plain or 0.
+  VLA_DEVICE RowRatios(const LinearInt8Job& job, int row, const float (&scale)[4], bool are_plain) {
+    const RowScale row_scale(job, row);
+    sum = row_scale.sum;
+    const float reciprocal = dev::divide(1, row_scale.s);
+#pragma unroll
+    for (int c = 0; c < 4; ++c) of[c] = quotient(scale[c], row_scale.s, reciprocal);
+    if (are_plain && is_plain(row_scale.s)) return;
+#pragma unroll 1
+    for (int c = 0; c < 4; ++c) of[c] = dev::divide(scale[c], row_scale.s);
+  }
+  VLA_DEVICE float scaled(int product, int c) const { return dev::multiply(static_cast<float>(product), of[c]); }
+};
+
 }  // namespace vla::cuda
