@@ -347,5 +347,5 @@ TEST_CASE_FIXTURE(Driver, "a model of a GPU says how long an act takes there: lo
   CHECK(!Engine::load(bundle, {.kernels = "model:h100"}).ok());  // it holds no weights
   const auto absent = Engine::load(bundle, {.kernels = "model:tpu", .dry = true});
   REQUIRE(!absent.ok());
-  CHECK(absent.error().expected == "one of orin-agx, rtx-3060, rtx-5090, h100");
+  CHECK(absent.error().expected == "one of orin-agx, rtx-3060, rtx-5090, h100, h200");
 }
