@@ -103,7 +103,7 @@ def test_a_family_of_its_published_size_has_kernels_and_a_prediction(vla, family
 def test_a_prediction_is_called_one_and_takes_no_option_of_a_measurement(vla):
     arguments = ["bench", "--arch", "smolvla", "--size", "full", *DEVICE, "--model"]
     assert vla(*arguments, "h100").out.startswith("prediction, not a measurement: smolvla on a model of H100")
-    vla(*arguments, "tpu").refused("usage", "expected one of orin-agx, rtx-3060, rtx-5090, h100, found tpu")
+    vla(*arguments, "tpu").refused("usage", "expected one of orin-agx, rtx-3060, rtx-5090, h100, h200, found tpu")
     vla(*arguments, "h100", "--markdown").refused("usage", "--model")
     vla("bench", "--arch", "smolvla", "--size", "full", "--model", "h100").refused("usage", "model: expected device cuda")
     assert json.loads(vla(*arguments, "h100", "--steps", "5", "--json").out)["n_step"] == 5
