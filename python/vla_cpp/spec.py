@@ -13,14 +13,14 @@ from .printable import printable
 @dataclass(frozen=True)
 class ViewSpec:
     """A camera. width, height: pixels that the network sees; frames of any size are letterboxed to it. camera: width and height of the
-    frames that the checkpoint states, 0 where it states none or `Policy` describes it."""
+    frames that the checkpoint states, 0 where it states none or `Policy` describes it: views are equal without it."""
 
     name: str
     optional: bool
     width: int
     height: int
     aliases: Tuple[str, ...] = ()
-    camera: Tuple[int, int] = (0, 0)
+    camera: Tuple[int, int] = field(default=(0, 0), compare=False)
 
 
 @dataclass(frozen=True)
