@@ -41,7 +41,7 @@ class Queue {
     std::size_t jobs, bytes;
   };
   static constexpr std::size_t kCrowd = 8;
-  static constexpr std::size_t kRecent = 32;
+  static constexpr std::size_t kRecent = 64;
   explicit Queue(Limits limits) : limits_(limits) {}
 
   std::size_t size() const { return line_.size(); }
