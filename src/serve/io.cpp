@@ -3,6 +3,7 @@
 #include "serve/io.h"
 
 #include <fmt/format.h>
+#include <malloc.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -12,6 +13,7 @@ namespace {
 
 constexpr auto kLinger = std::chrono::seconds(2);  // for the last answers on the way out
 constexpr std::uint64_t kMaxDeadlineMs = 86'400'000;
+constexpr int kTrimEvery = 5;  // seconds
 
 Error shutting_down() { return {Code::shutting_down, "act", "", "the server drains before it stops"}; }
 
@@ -62,8 +64,14 @@ void Io::wait(std::optional<Clock::time_point> until) {
   loop_.wait(
       [this] {
         for (const auto& front : fronts_) front->begin(*this);
+        sweeper_.turn([this] { sweep(); });
       },
       exchange_.fd(), until);
+}
+
+/// What a flood of acts took lies between what is in use, where malloc keeps it.
+void Io::sweep() {
+  if (++n_sweep_ % kTrimEvery == 0) ::malloc_trim(0);
 }
 
 bool Io::has_answers() const {

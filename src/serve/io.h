@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "net/loop.h"
+#include "net/sweeper.h"
 #include "serve/exchange.h"
 #include "serve/policies.h"
 
@@ -74,6 +75,7 @@ class Io {
   void deliver_waiting();
   void refuse_waiting();
   void wait(std::optional<Clock::time_point> until);
+  void sweep();
   bool has_answers() const;
 
   net::Loop& loop_;
@@ -82,6 +84,8 @@ class Io {
   Policies& policies_;
   ServerState& state_;
   std::span<Observer* const> observers_;
+  net::Sweeper sweeper_{loop_};
+  int n_sweep_ = 0;
 };
 
 }  // namespace vla::serve
