@@ -14,8 +14,8 @@ server and its processes before, at the peak, and --settle seconds after the att
 
 The attacks are in scripts/attacks/. They come from 127.0.0.2 (`own_address` from the robots' 127.0.0.1 and
 `many_addresses` from 256 others), after all other work of the machine, since they are to attack the server and not the
-cores that it shares with them here; with --real-time as other work, and server and robots before it. An answer that is wrong
-ends the script. docs/security.md says what is promised.
+cores that it shares with them here; with --real-time before all other work, and server and robots before them. An answer that is
+wrong ends the script. docs/security.md says what is promised.
 """
 
 import argparse
@@ -46,10 +46,9 @@ def p(values, percent):
 
 
 def give_way(options):
-    """To the server and to who behaves: they are before all other work of the machine, or this comes after it."""
+    """To the server and to who behaves."""
     os.sched_setscheduler(0, os.SCHED_OTHER if options.real_time else os.SCHED_IDLE, os.sched_param(0))
-    if not options.real_time:
-        os.nice(19)
+    os.nice(-20 if options.real_time else 19)
 
 
 def cpu_seconds(pid):
@@ -191,7 +190,7 @@ def parse():
     parser.add_argument("--patience", type=float, default=5, help="seconds, after which an act is lost; default: 5")
     parser.add_argument("--check", action="store_true", help="exit code 1 where a bar is missed")
     parser.add_argument("--loose", type=float, default=1, help="factor on the bars of time, where other work goes on")
-    parser.add_argument("--real-time", action="store_true", help="server and robots before all other work; takes root")
+    parser.add_argument("--real-time", action="store_true", help="server and robots, then the attacks, before all other work; takes root")
     parser.add_argument("--as", dest="role", nargs=1 + len(Target.PLACES), help=argparse.SUPPRESS)  # attacks, then Target's addresses
     return parser.parse_args()
 

@@ -166,7 +166,7 @@ class Behaved:
 
     def _repeat(self, name, times, what, period):
         """At uneven times: robots whose periods were in step would meet at the engine always, or never."""
-        draw, lost_at = random.Random(period), None
+        draw, lost_at = random.Random(name), None
         while time.monotonic() < self._until:
             start = time.perf_counter()
             try:
