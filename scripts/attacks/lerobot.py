@@ -166,7 +166,7 @@ def robot_of(target, reverse=False):
     spec = spec_of(target)
     images, _ = scene(spec, 1)
     cameras = {name.removeprefix("observation.images."): frame for name, frame in images.items()}
-    motors = [f"motor{i}" for i in range(spec.states[0].width)]
+    motors = list(spec.states[0].names)
     motors = motors[::-1] if reverse else motors
     seen = {**dict.fromkeys(motors, 0.1), **cameras, "task": "go"}
     return lerobot_pickles.dumps(lerobot_pickles.setup_of(motors, cameras)), seen

@@ -132,9 +132,9 @@ class Behaved:
         self._messages = pack(openpi_act(spec, 1, scale), openpi_array), pack(gr00t_act(spec, 1, scale), numpy_array)
         self._lerobot = None
         if importlib.util.find_spec("grpc"):
-            self._lerobot, n = lerobot_calls.Robot(target.lerobot.removeprefix("tcp://"), self._patience), spec.states[0].width
+            self._lerobot = lerobot_calls.Robot(target.lerobot.removeprefix("tcp://"), self._patience)
             cameras = {name.removeprefix("observation.images."): frame for name, frame in images.items()}
-            motors = {f"motor{i}": 0.1 for i in range(n)}
+            motors = dict.fromkeys(spec.states[0].names, 0.1)
             self._setup = lerobot_pickles.setup_of(motors, cameras)
             self._lerobot.begin(self._setup)
             seen = {**motors, **cameras, "task": "open the drawer"}
