@@ -92,6 +92,18 @@ MISTAKES = {
         "dev::multiply(static_cast<float>(product), dev::divide(scale, s))",
         "dev::divide(dev::multiply(static_cast<float>(product), scale), s)",
     ),
+    "a quotient without its correction": (
+        "row_scale.h",
+        "hopper_linear_int8",
+        "return dev::multiply_add(dev::multiply_add(-b, q, a), reciprocal, q);",
+        "return dev::multiply(a, reciprocal);",
+    ),
+    "no division near the ends of the exponents": (
+        "row_scale.h",
+        "hopper_linear_int8",
+        "if (are_plain && is_plain(row_scale.s)) return;",
+        "return;",
+    ),
     "a split too short": (
         "linear_int8.cu",
         "linear_int8",

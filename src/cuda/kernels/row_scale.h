@@ -49,7 +49,7 @@ struct RowRatios {
 #pragma unroll
     for (int c = 0; c < 4; ++c) of[c] = quotient(scale[c], row_scale.s, reciprocal);
     if (are_plain && is_plain(row_scale.s)) return;
-#pragma unroll 1
+#pragma unroll
     for (int c = 0; c < 4; ++c) of[c] = dev::divide(scale[c], row_scale.s);
   }
   VLA_DEVICE float scaled(int product, int c) const { return dev::multiply(static_cast<float>(product), of[c]); }
