@@ -44,7 +44,7 @@ struct MemoryUse {
 struct MemoryBudget {
   std::size_t size = 0;
   std::size_t process = 0;   // the process without the engine's memory; 0 on a GPU
-  std::size_t smallest = 0;  // the least budget that would work
+  std::size_t smallest = 0;  // the least budget that works in every process, which differ in size
   std::size_t n_read = 0;    // read from the file in every act; 0: all matrices stay in memory
 };
 

@@ -280,8 +280,8 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
     VLA_CHECK(check_supported(device, program->graph_, n_before, node));
     program->work_[stage_end.size()] += work_of(node);
     phase_end.push_back(ggml_graph_n_nodes(program->graph_));
-    std::vector<const Param*>& reads = program->reads_.emplace_back();
-    if (const auto* linear = node.as<op::Linear>()) reads.push_back(linear->weight);
+    lower::MatrixReads::value_type& reads = program->reads_.emplace_back();
+    if (const auto* linear = node.as<op::Linear>()) reads.push_back({linear->weight});
   }
   while (stage_end.size() < n_stage) stage_end.push_back(phase_end.size());
   for (const Graph::Stage& stage : graph.stages()) program->stages_.push_back({stage.name, {}});

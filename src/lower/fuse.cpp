@@ -26,9 +26,11 @@ class Fuser {
       const auto* window = std::get_if<WindowOp>(&op.op);
       return (row != nullptr && l.fused[at(row->node)]) || (window != nullptr && l.fused[at(window->node)]);
     });
-    for (FusedOp& op : ops_)
+    for (FusedOp& op : ops_) {
       for (const Operand& read : std::visit([](auto& what) { return what.operands(); }, op.op))
         if (read.id != kNone) op.reads.push_back(read.id);
+      if (const auto* linear = std::get_if<LinearOp>(&op.op)) op.matrices = matrices_of(linear->linears);
+    }
     std::stable_sort(ops_.begin(), ops_.end(), [](const FusedOp& a, const FusedOp& b) { return a.order < b.order; });
     return std::move(ops_);
   }
@@ -64,6 +66,17 @@ class Fuser {
   }
 
   Multiplier multiplier(const Node& linear) const { return l.target.multiplier(*linear.as<op::Linear>()->weight); }
+  static std::vector<const Param*> matrices_of(const std::vector<const Node*>& linears) {
+    std::vector<const Param*> matrices;
+    for (const Node* linear : linears) matrices.push_back(linear->as<op::Linear>()->weight);
+    return matrices;
+  }
+  /// Whether one operation may read the matrices of these products and of one more.
+  bool may_join(std::vector<const Node*> linears, const Node* other) const {
+    const bool has_kernel = multiplier(*other).kernel == multiplier(*linears[0]).kernel;
+    linears.push_back(other);
+    return has_kernel && share_group(l, matrices_of(linears));
+  }
 
   void visit_linear(const Node& linear) {
     LinearOp op;
@@ -119,7 +132,7 @@ class Fuser {
       if (gate->as<op::Linear>() == nullptr || only_reader(*gate) != activate) return nullptr;
     }
     if (up->as<op::Linear>() == nullptr || only_reader(*up) != product || up->in[0] != gate->in[0] ||
-        multiplier(*up).kernel != multiplier(*gate).kernel || up->shape != gate->shape)
+        !may_join({gate}, up) || up->shape != gate->shape)
       return nullptr;
     op.linears = {gate, up}, op.gated = true, op.activation = activate->as<op::Activate>()->activation;
     take(gate), take(up), take(activate);
@@ -198,7 +211,8 @@ class Fuser {
           linear->residual != kNone)
         continue;
       FusedOp*& first = open[{linear->x, multiplier(*linear->linears[0]).kernel}];
-      if (first == nullptr || first->writes.size() == l.target.max_products) {
+      if (first == nullptr || first->writes.size() == l.target.max_products ||
+          !may_join(std::get<LinearOp>(first->op).linears, linear->linears[0])) {
         first = &op;
         continue;
       }

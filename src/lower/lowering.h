@@ -52,6 +52,7 @@ using Operands = std::vector<Operand>;
 /// An operation as the passes after fusion see it.
 struct Step {
   std::vector<ValueId> reads, writes;  // reads: the operands without kNone, in order
+  std::vector<const Param*> matrices;  // that it multiplies by
   int order = 0;                       // the id of the node whose result it computes
   bool invariant = false;              // its result is the same in every run
   int phase = 0;
@@ -73,6 +74,8 @@ struct Lowering {
   const Value& value(ValueId id) const { return values[static_cast<std::size_t>(id)]; }
   Value& base(ValueId id) { return value(value(id).base); }
   const Value& base(ValueId id) const { return value(value(id).base); }
+  /// The group in which a matrix is streamed, or -1.
+  int group_of(const Param& matrix) const { return target.groups[static_cast<std::size_t>(matrix.id)]; }
   /// The phase of a run after which a value is available.
   int there_in(ValueId id) const { return std::max(base(id).made, n_prepare); }
 };
@@ -98,13 +101,19 @@ void start(Lowering& l);
 void schedule(Lowering& l, std::vector<Step*> steps);
 /// Sets Value::begin: places of values in the arena or in the program's own memory.
 void place(Lowering& l, const std::vector<Step*>& steps);
-/// Schedules and places a target's operations, and sorts them by phase.
+/// Cuts phases until each reads groups of streamed matrices that stand in the windows together. An operation reads one
+/// group at most (`share_group`). Values keep their places: none lives longer than before beside another one.
+void split(Lowering& l, const std::vector<Step*>& steps);
+/// Whether one operation may read all of these matrices: those of them that are streamed are in the same group.
+bool share_group(const Lowering& l, const std::vector<const Param*>& matrices);
+/// Schedules, places and splits a target's operations, and sorts them by phase.
 template <class TargetOp>
 void arrange(Lowering& l, std::vector<TargetOp>& ops) {
   std::vector<Step*> steps;
   for (TargetOp& op : ops) steps.push_back(&op);
   schedule(l, steps);
   place(l, steps);
+  split(l, steps);
   std::stable_sort(ops.begin(), ops.end(), [](const Step& a, const Step& b) {
     return std::pair(a.phase, a.order) < std::pair(b.phase, b.order);
   });

@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <functional>
+#include <vector>
 
 #include "bundle/params.h"
 
@@ -37,6 +38,8 @@ struct Target {
   std::int64_t min_rounded_keys;  // attention over fewer keys stays float32
   bool keeps_taps;                // true: taps are read after the run; false: after the phase that makes them
   std::size_t alignment;          // of every value, in bytes
+  /// By Param::id, the group in which a matrix is streamed (host/weight_stream.h), or -1.
+  const std::vector<int>& groups;
 
   std::size_t aligned(std::size_t size) const { return (size + alignment - 1) / alignment * alignment; }
 };

@@ -33,11 +33,11 @@ std::map<ValueId, std::vector<CpuOp*>> readers_of(CpuLowering& l) {
 }
 
 /// Moves product `up` into the blocks of `down`, the only reader of its result, and leaves `up` without results.
-void join(CpuLowering& l, CpuOp& up, CpuOp& down, std::int64_t n_block) {
+void join(CpuLowering& l, CpuOp& up, CpuOp& down, std::int64_t n_block, std::vector<const Param*> matrices) {
   const ValueId inner = up.writes[0];
   l.value(inner).placement = Value::Placement::thread;
   CpuOp both;
-  both.reads = up.reads, both.writes = down.writes, both.order = down.order;
+  both.reads = up.reads, both.writes = down.writes, both.matrices = std::move(matrices), both.order = down.order;
   std::copy_if(down.reads.begin(), down.reads.end(), std::back_inserter(both.reads),
                [&](ValueId id) { return id != inner; });
   BlockedOp blocked = {{}, n_block};
@@ -60,8 +60,11 @@ void choose_blocks(CpuLowering& l) {
     CpuOp& down = *found->second[0];
     const auto* reader = std::get_if<LinearOp>(&down.op);
     if (reader == nullptr || reader->x != inner || l.value(inner).placement != Value::Placement::arena) continue;
+    std::vector<const Param*> matrices = up.matrices;
+    matrices.insert(matrices.end(), down.matrices.begin(), down.matrices.end());
+    if (!share_group(l, matrices)) continue;
     if (const std::int64_t n_block = n_block_of(l, l.value(inner), kernel_of(l, *reader->linears[0])))
-      join(l, up, down, n_block);
+      join(l, up, down, n_block, std::move(matrices));
   }
   std::erase_if(l.ops, [](const CpuOp& op) { return op.writes.empty(); });
 }

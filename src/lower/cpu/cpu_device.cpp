@@ -88,7 +88,8 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
                          .max_products = kernels::LinearJob::kMaxPart,
                          .min_rounded_keys = rounds_to_bf16(arithmetic_.use) ? min_rounded_keys_ : kNoKeys,
                          .keeps_taps = !options.see_tap,
-                         .alignment = kAlignment};
+                         .alignment = kAlignment,
+                         .groups = weights_.groups()};
   CpuLowering l = {{.graph = graph, .options = options, .target = target}, weights_, arithmetic_.use, n_thread()};
   start(l);
   std::vector<FusedOp> ops = fuse(l);

@@ -59,7 +59,7 @@ Status CpuProgram::give_addresses(CpuLowering& l) {
 Status CpuProgram::make_tasks(const CpuLowering& l) {
   std::size_t scratch = 0;
   n_prepare_ = static_cast<std::size_t>(l.n_prepare);
-  phases_.resize(static_cast<std::size_t>(l.n_phase)), uses_.resize(phases_.size());
+  phases_.resize(static_cast<std::size_t>(l.n_phase)), uses_.resize(phases_.size()), reads_.resize(phases_.size());
   const auto& stages = l.graph.stages();
   std::vector<std::string> likeness(phases_.size());
   counted_.resize(phases_.size());
@@ -71,6 +71,7 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
     scratch = std::max(scratch, run.scratch);
     const std::string text = text_of(l, op, run);
     uses_[phase].insert(uses_[phase].end(), run.matrices.begin(), run.matrices.end());
+    if (!op.matrices.empty()) reads_[phase].push_back(op.matrices);
     tasks_.push_back(std::move(run.task));
     tasks_.back()->kind = run.kind, tasks_.back()->clock = clock_.get();
     phases_[phase].tasks.push_back(tasks_.back().get());
@@ -108,10 +109,6 @@ void CpuProgram::make_taps(const CpuLowering& l) {
 }
 
 Status CpuProgram::cut(const CpuWeights& weights) {
-  for (const MatrixUses& phase : uses_) {
-    reads_.emplace_back();
-    for (const MatrixUse& use : phase) reads_.back().push_back(use.matrix);
-  }
   VLA_TRY(const std::vector<Groups> groups, find_groups(reads_, weights.groups()));
   prepare_ = cut_phases(std::span(groups).first(n_prepare_), 0);
   run_ = cut_phases(std::span(groups).subspan(n_prepare_), n_prepare_);

@@ -99,7 +99,8 @@ Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const Low
                          .max_products = 1,
                          .min_rounded_keys = min_rounded_keys_,
                          .keeps_taps = true,
-                         .alignment = kDeviceAlignment};
+                         .alignment = kDeviceAlignment,
+                         .groups = weights_.groups()};
   CudaLowering l = {
       {.graph = graph, .options = options, .target = target}, weights_, queue_->n_sm(), queue_->is_hopper()};
   start(l);

@@ -84,8 +84,7 @@ Result<std::vector<int>> CudaProgram::make_parts(const CudaLowering& l) {
     n_launch.push_back(static_cast<int>(calls.size()));
     const auto phase = static_cast<std::size_t>(op.phase);
     phases[phase].push_back(std::move(calls));
-    if (const auto* product = std::get_if<LinearOp>(&op.op))
-      for (const Node* node : product->linears) reads_[phase].push_back(node->as<op::Linear>()->weight);
+    if (!op.matrices.empty()) reads_[phase].push_back(op.matrices);
   }
   for (std::vector<Calls>& phase : phases) merge_calls(phase, l.n_sm);
   VLA_TRY(const std::vector<Groups> groups, find_groups(reads_, l.weights.groups()));

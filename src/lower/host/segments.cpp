@@ -39,11 +39,12 @@ void Groups::add(int group) {
 Result<std::vector<Groups>> find_groups(const MatrixReads& phases, const std::vector<int>& groups) {
   std::vector<Groups> found(phases.size());
   for (std::size_t i = 0; i < phases.size(); ++i) {
-    for (const Param* matrix : phases[i]) found[i].add(groups[static_cast<std::size_t>(matrix->id)]);
+    for (const OpMatrices& op : phases[i])
+      for (const Param* matrix : op) found[i].add(groups[static_cast<std::size_t>(matrix->id)]);
     if (found[i].last - found[i].first >= WeightStream::kWindows)
-      return Error{Code::unsupported, "memory",
+      return Error{Code::internal, "memory",
                    "phases that read at most " + std::to_string(WeightStream::kWindows) + " groups of matrices",
-                   std::to_string(found[i].last - found[i].first + 1), "give a larger budget"};
+                   std::to_string(found[i].last - found[i].first + 1), "please report this"};
   }
   return found;
 }

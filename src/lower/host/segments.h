@@ -26,8 +26,8 @@ struct Segment {
   int released = -1;  // groups up to this one are needed no more then; -1: none
 };
 
-/// The groups that each of some phases reads, where a matrix of id i is in groups[i]. Errors: unsupported where a phase
-/// reads more of them than there are windows.
+/// The groups that each of some phases reads, where a matrix of id i is in groups[i]. Errors: internal where they do
+/// not fit into the windows, which phases that were split (lower/split.cpp) do.
 Result<std::vector<Groups>> find_groups(const MatrixReads& phases, const std::vector<int>& groups);
 
 /// Cuts phases, of which the first has the number `begin`, where groups must come and where one is needed no more.

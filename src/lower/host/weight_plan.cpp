@@ -3,6 +3,7 @@
 #include "lower/host/weight_plan.h"
 
 #include <algorithm>
+#include <map>
 #include <set>
 
 #include "lower/host/weight_stream.h"
@@ -15,8 +16,9 @@ using Group = std::vector<const Param*>;
 class Planner {
  public:
   explicit Planner(const WeightUse& use) : use_(use) {
-    for (const Group& phase : use.step) resident_.insert(phase.begin(), phase.end());
-    group_phases();
+    for (const auto& phase : use.step)
+      for (const OpMatrices& op : phase) resident_.insert(op.begin(), op.end());
+    while (!group_phases()) groups_.clear();
   }
 
   /// The plan that streams least of those that fit.
@@ -35,21 +37,35 @@ class Planner {
   }
 
  private:
-  /// Phases that follow each other, as many to a group as the largest of them has room for.
-  void group_phases() {
+  /// Phases that follow each other, as many to a group as the largest of them has room for. Where an operation would
+  /// read several groups, its matrices become resident and the answer is false.
+  bool group_phases() {
     std::vector<Group> phases;
     std::set<const Param*> seen = resident_;
-    for (const Group& all : use_.prefix) {
+    window_ = 0;
+    for (const auto& ops : use_.prefix) {
       Group& phase = phases.emplace_back();
-      for (const Param* matrix : all)
-        if (seen.insert(matrix).second) phase.push_back(matrix);
+      for (const OpMatrices& op : ops)
+        for (const Param* matrix : op)
+          if (seen.insert(matrix).second) phase.push_back(matrix);
       window_ = std::max(window_, size(phase));
     }
+    std::map<const Param*, std::size_t> group_of;
     for (const Group& phase : phases) {
       if (phase.empty()) continue;
       if (groups_.empty() || size(groups_.back()) + size(phase) > window_) groups_.emplace_back();
       groups_.back().insert(groups_.back().end(), phase.begin(), phase.end());
+      for (const Param* matrix : phase) group_of[matrix] = groups_.size() - 1;
     }
+    const std::size_t n_resident = resident_.size();
+    for (const auto& ops : use_.prefix)
+      for (const OpMatrices& op : ops) {
+        std::set<std::size_t> groups;
+        for (const Param* matrix : op)
+          if (const auto found = group_of.find(matrix); found != group_of.end()) groups.insert(found->second);
+        if (groups.size() > 1) resident_.insert(op.begin(), op.end());
+      }
+    return resident_.size() == n_resident;
   }
 
   /// n of the groups.

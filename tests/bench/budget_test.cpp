@@ -1,0 +1,120 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// The least memory that published policies are told to need, of which nothing is filled or computed.
+#include <doctest/doctest.h>
+
+#include "bench/random_bundle.h"
+#include "devices/devices.h"
+#include "engine/plan.h"
+#include "engine/robot.h"
+#include "lower/cuda/cuda_device.h"
+#include "policies/policy.h"
+
+using namespace vla;
+
+namespace {
+
+using OpenDevice = std::function<Result<std::unique_ptr<Device>>()>;
+
+Keys of_published_views(const PolicyEntry& entry, bench::RandomSizes& sizes) {
+  Keys keys = entry.published();
+  if (const auto n_view = keys.has("policy.n_view") ? keys.integer("policy.n_view", {1, 16}) : Result(sizes.n_view))
+    sizes.n_view = *n_view;
+  return keys;
+}
+
+bench::RandomBundle dry_bundle(const PolicyEntry& entry) {
+  bench::RandomSizes sizes = {.is_filled = false};
+  const Keys keys = of_published_views(entry, sizes);
+  auto made = bench::RandomBundle::make(entry.name, keys, sizes);
+  REQUIRE_MESSAGE(made.ok(), (made ? "" : made.error().message()));
+  return std::move(*made);
+}
+
+class DryPolicy {
+ public:
+  DryPolicy(const Bundle& bundle, const OpenDevice& open) {
+    auto robot = Robot::open(bundle, nullptr);
+    REQUIRE_MESSAGE(robot.ok(), (robot ? "" : robot.error().message()));
+    robot_ = std::move(*robot);
+    auto device = open();
+    REQUIRE_MESSAGE(device.ok(), (device ? "" : device.error().message()));
+    device_ = std::move(*device);
+  }
+
+  Device& device() { return *device_; }
+  /// Loads with this plan.
+  Status load(const WeightPlan& plan) {
+    VLA_CHECK(device_->load(robot_->params(), false, plan));
+    return robot_->compute_constants(*device_, true);
+  }
+  Result<std::unique_ptr<Plan>> plan_for(const InputShape& shape) {
+    return Plan::build(robot_->network(), shape, {*device_, "", true});
+  }
+  InputShape largest() const { return robot_->largest_shape(); }
+  /// Of other observations: of a word, of one view, of a chunk to continue.
+  std::vector<InputShape> others() const {
+    std::vector<InputShape> all;
+    const auto add = [&](const auto& change) {
+      InputShape shape = largest();
+      change(shape);
+      if (robot_->network().policy.check(shape).ok()) all.push_back(shape);
+    };
+    add([](InputShape& shape) { shape.n_text = std::max(std::min(1, shape.n_text), shape.n_text - 47); });
+    add([](InputShape& shape) { shape.n_view = 1, shape.views &= 1; });
+    add([](InputShape& shape) { shape.steered = true; });
+    return all;
+  }
+
+ private:
+  std::unique_ptr<Robot> robot_;
+  std::unique_ptr<Device> device_;
+};
+
+void check_ok(const Status& status) { REQUIRE_MESSAGE(status.ok(), (status.ok() ? "" : status.error().message())); }
+
+/// With the least that is planned, every program of the policy is made, and takes what was planned.
+void check_least(const Bundle& bundle, const OpenDevice& open) {
+  DryPolicy policy(bundle, open);
+  Device& device = policy.device();
+  if (const Status status = policy.load({}); !status.ok()) {
+    REQUIRE(status.error().code == Code::unsupported);  // nothing is rounded
+    return;
+  }
+  WeightPlan least;
+  std::size_t working = 0;
+  {
+    const auto largest = policy.plan_for(policy.largest());
+    REQUIRE_MESSAGE(largest.ok(), (largest ? "" : largest.error().message()));
+    least = *device.plan_weights((*largest)->prefix(), (*largest)->step(), 0);
+    working = device.working_size();
+    CHECK(least.smallest <= device.weights_size());
+  }
+  check_ok(policy.load(least));
+  CHECK(device.weights_size() == least.smallest);
+  const auto largest = policy.plan_for(policy.largest());
+  REQUIRE_MESSAGE(largest.ok(), (largest ? "" : largest.error().message()));
+  CHECK(device.working_size() == working);
+  for (const InputShape& shape : policy.others()) {
+    const auto plan = policy.plan_for(shape);
+    CHECK_MESSAGE(plan.ok(), (plan ? "" : plan.error().message()));
+  }
+}
+
+}  // namespace
+
+TEST_CASE("the least memory that a published policy is told to need suffices for each of its programs") {
+  for (const PolicyEntry& entry : policy_registry()) {
+    CAPTURE(entry.name);
+    const bench::RandomBundle file = dry_bundle(entry);
+    const auto bundle = Bundle::open(file.path());
+    REQUIRE(bundle.ok());
+    for (const std::string kernels : {"", "portable", "int8", "int4"}) {
+      CAPTURE(kernels);
+      check_least(*bundle, [&] { return open_device(2, kernels); });
+    }
+    for (const Rounding rounding : {Rounding::none, Rounding::int8, Rounding::float32})
+      check_least(*bundle, [&] { return lower::CudaDevice::model("orin-agx", rounding); });
+  }
+}
