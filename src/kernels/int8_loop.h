@@ -35,6 +35,10 @@ template <class Tile>
 constexpr bool kTakesPairs = requires {
   Tile::kPairs;
 };
+template <class Tile>
+constexpr bool kHasPanel = requires {
+  typename Tile::Panel;
+};
 template <class Tile, class Weights>
 using StripsOf = typename Weights::template Strips<Tile::kColumns / static_cast<int>(Int8Panels::kColumns)>;
 
@@ -51,7 +55,9 @@ using StripsOf = typename Weights::template Strips<Tile::kColumns / static_cast<
 /// Where an instruction takes two rows by two columns (kPairs), rows are copied in pairs and elements of any width
 /// rearranged, both by the tile: pair(first, second, depth, to) and expand(strips, depth, to); then multiply has the
 /// latter's bytes for `strips` and no between().
-/// A file that includes this is compiled with -ffp-contract=off: what follows the sums is rounded one by one.
+/// A tile may have a Panel of its own, of kSize bytes at most, for many rows: expand(strips, depth, to) makes it of a
+/// step, and multiply has it for `strips`. A file that includes this is compiled with -ffp-contract=off: what follows
+/// the sums is rounded one by one.
 template <class Tile, class Weights>
 concept Int8Tile = requires {
   typename Tile::V::Int;
@@ -75,7 +81,7 @@ concept Int8Tile = requires {
 template <class Tile, class Weights>
 requires Int8Tile<Tile, Weights>
 class Int8Loop {
-  static constexpr bool kPairs = kTakesPairs<Tile>;
+  static constexpr bool kPairs = kTakesPairs<Tile>, kOwnPanel = kHasPanel<Tile>;
   using V = typename Tile::V;
   using Stripes = LinearStripes<Tile, Tile::kLayout>;
   using Finish = typename Stripes::Finish;
@@ -88,11 +94,16 @@ class Int8Loop {
   static constexpr bool kFirstExpands = requires { Tile::kFirstExpands; };
   static constexpr std::int32_t kOffset = Tile::kSigned ? 0 : Weights::kOffset;
 
+  static constexpr std::int64_t panel_size() {
+    if constexpr (kOwnPanel) return Tile::Panel::kSize;
+    return kPacked || kPairs ? Tile::kStep * kColumns : 1;
+  }
+
   struct Scratch {
     // In pairs: the rows of x in the block. Items of one block are consecutive, so a worker copies it once.
     std::int64_t row;
     alignas(64) std::byte x[kPairs ? (Tile::kBlockKiB << 10) + (kRows + 1) * quantized_stride(kMaxPairedDepth) : 1];
-    alignas(64) std::byte panel[kPacked || kPairs ? Tile::kStep * kColumns : 1];
+    alignas(64) std::byte panel[panel_size()];
     alignas(64) std::int32_t sums[(kBlockRows + kRows) * kColumns];
     alignas(64) float gates[(kBlockRows + kRows) * kColumns];
     alignas(64) float scaled[kRows * kColumns];
@@ -195,6 +206,9 @@ class Int8Loop {
       bool expands = false;
       if constexpr (kPairs) {
         Tile::expand(numbers, d, scratch_->panel);
+      } else if constexpr (kOwnPanel) {
+        expands = job_.n_row > kFewRows;
+        if (expands) Tile::expand(numbers, d, scratch_->panel);
       } else if constexpr (kPacked) {
         expands = job_.n_row > kFewRows;
         if (expands && !kFirstExpands) expand<typename V::Int, kStrips>(numbers, 0, d, scratch_->panel);
@@ -213,6 +227,8 @@ class Int8Loop {
                          scratch_->panel, d, sums, k > 0);
         else if (!expands)
           multiply(numbers);
+        else if constexpr (kOwnPanel)
+          multiply(typename Tile::Panel{scratch_->panel});
         else if constexpr (kFirstExpands && kPacked)
           t == 0 ? multiply(ExpandingStrips<kStrips, Numbers>{scratch_->panel, numbers})
                  : multiply(ExpandedStrips<kStrips, Numbers>{scratch_->panel, numbers});

@@ -94,6 +94,81 @@ struct Avx2Tile {
   }
 };
 
+/// The same for many rows, without the product of signs: code ^ sign is -code - 1 where a weight is negative, so a sum
+/// lacks the magnitudes of all negative weights of its column. Magnitudes, signs and what sums lack are made once per
+/// step of the depth.
+struct SignedTile : Avx2Tile<SignedProducts> {
+  /// For each four elements of 16 columns a line of magnitudes and one of signs, all bits of which are ones where a
+  /// weight is negative; behind all lines what the columns' sums lack.
+  struct Panel {
+    static constexpr std::int64_t kSize = 2 * kStep * kColumns + kColumns * 4;
+    const std::byte* lines;
+  };
+  static_assert(2 * 128 * 127 <= 32767 && 2 * 128 * -128 >= -32768);
+
+  template <class Strips>
+  static void expand(const Strips& strips, std::int64_t depth, std::byte* to) {
+    __m256i lack[2] = {_mm256_setzero_si256(), _mm256_setzero_si256()};
+    std::byte* line = to;
+    for (std::int64_t k = 0; k < depth; k += Int8Panels::kGroup)
+      for (int s = 0; s < 4; ++s, line += 2 * Int8Panels::kLine)
+#pragma GCC unroll 2
+        for (int i = 0; i < 2; ++i) {
+          const __m256i weights = strips.template load<__m256i>(k, s, 0, 32 * i) ^ _mm256_set1_epi8(-128);
+          const __m256i size = _mm256_abs_epi8(weights), sign = _mm256_cmpgt_epi8(_mm256_setzero_si256(), weights);
+          _mm256_store_si256(reinterpret_cast<__m256i*>(line + 32 * i), size);
+          _mm256_store_si256(reinterpret_cast<__m256i*>(line + Int8Panels::kLine + 32 * i), sign);
+          const __m256i pairs = _mm256_maddubs_epi16(size & sign, _mm256_set1_epi8(1));
+          lack[i] = _mm256_add_epi32(lack[i], _mm256_madd_epi16(pairs, _mm256_set1_epi16(1)));
+        }
+    std::memcpy(line, lack, sizeof(lack));
+  }
+
+  using Avx2Tile::multiply;
+  template <class Between>
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Panel& panel, std::int64_t depth,
+                       std::int32_t* sums, bool add, const Between&) {
+    with_height<kRows>(n_row, [&]<int n>() { many<n>(x, x_stride, panel.lines, depth, sums, add); });
+  }
+
+ private:
+  template <int kCount>
+  static void many(const std::byte* x, std::int64_t x_stride, const std::byte* lines, std::int64_t depth,
+                   std::int32_t* sums, bool add) {
+    const auto load = [&](int byte)
+                          VLA_LAMBDA { return _mm256_load_si256(reinterpret_cast<const __m256i*>(lines + byte)); };
+    const __m256i ones = _mm256_set1_epi16(1);
+    __m256i sum[kCount][2];
+#pragma GCC unroll 4
+    for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = _mm256_setzero_si256();
+    for (const std::byte* const end = x + depth; x < end;)
+#pragma GCC unroll 4
+      for (int s = 0; s < 4; ++s, x += 4, lines += 2 * Int8Panels::kLine) {
+        const __m256i size[2] = {load(0), load(32)}, sign[2] = {load(64), load(96)};
+#pragma GCC unroll 4
+        for (int r = 0; r < kCount; ++r) {
+          std::int32_t four;
+          std::memcpy(&four, x + r * x_stride, sizeof(four));
+          const __m256i codes = _mm256_set1_epi32(four);
+#pragma GCC unroll 2
+          for (int i = 0; i < 2; ++i) {
+            __m256i pairs;  // from intrinsics, compilers run out of registers
+            asm("vpxor %4, %2, %1\n\tvpmaddubsw %1, %3, %1\n\tvpmaddwd %5, %1, %1\n\tvpaddd %1, %0, %0"
+                : "+x"(sum[r][i]), "=&x"(pairs)
+                : "x"(codes), "x"(size[i]), "x"(sign[i]), "x"(ones));
+          }
+        }
+      }
+#pragma GCC unroll 4
+    for (int r = 0; r < kCount; ++r)
+      for (int i = 0; i < 2; ++i) {
+        auto* place = reinterpret_cast<__m256i*>(sums + r * kColumns + 8 * i);
+        const __m256i total = _mm256_add_epi32(sum[r][i], load(32 * i));
+        _mm256_storeu_si256(place, add ? _mm256_add_epi32(total, _mm256_loadu_si256(place)) : total);
+      }
+  }
+};
+
 /// Products of int4 weights: pairs of code products are summed to 16 bits, which hold a block's sum minus eight times
 /// the sum of x in it: 32 * 7 * 127. The block's step multiplies that.
 struct Int4Tile {
@@ -171,6 +246,6 @@ const LinearKernel kTernaryAvx2 = Int8Loop<Avx2Tile<TwoProducts>, TernaryPanels>
 const LinearKernel kInt4AvxVnni = Int8Loop<Avx2Tile<FourProducts>, Int4Panels>::kernel("avxvnni_int8", supports_vnni);
 const LinearKernel kInt4Avx2 = Int8Loop<Int4Tile, Int4Codes>::kernel("avx2_int8", supports);
 const LinearKernel kInt8AvxVnni = Int8Loop<Avx2Tile<FourProducts>, BytePanels>::kernel("avxvnni_int8", supports_vnni);
-const LinearKernel kInt8Avx2 = Int8Loop<Avx2Tile<SignedProducts>, BytePanels>::kernel("avx2_int8", supports);
+const LinearKernel kInt8Avx2 = Int8Loop<SignedTile, BytePanels>::kernel("avx2_int8", supports);
 
 }  // namespace vla::kernels
