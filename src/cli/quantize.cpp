@@ -185,7 +185,7 @@ Status calibrate_first(QuantizeOptions options) {
 class Trials {
  public:
   explicit Trials(const std::string& to) {
-    for (const char* ending : {".smoothed", ".int4", ".trial"}) files_.push_back(to + ending);
+    for (const char* ending : {".smoothed", ".smoothed.int4", ".int4", ".trial"}) files_.push_back(to + ending);
     remove();
     struct sigaction action = {};
     action.sa_handler = [](int signal) {
