@@ -52,6 +52,14 @@ void add_stages(Checkup& checkup, const StagePredictions& predicted) {
   checkup.host = checkup.total - report.find("network")->p50;
 }
 
+/// Predicted milliseconds of the network with large matrices as int8 codes; 0 where it has none of floats.
+double predict_int8(const Request& request) {
+  const auto dry = Engine::load(
+      request.bundle, {.n_thread = request.n_thread, .kernels = "int8", .dry = true, .embodiment = request.embodiment});
+  const auto predicted = dry ? (*dry)->predict() : Result<StagePredictions>(dry.error());
+  return predicted ? predicted_ms(*predicted, "network") : 0;
+}
+
 }  // namespace
 
 std::size_t free_memory(const std::string& meminfo, const std::string& limit, const std::string& used) {
@@ -84,6 +92,7 @@ Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, 
   Checkup checkup;
   StagePredictions predicted;
   const bool on_cpu = request.device.empty() || request.device == "cpu";
+  bool has_floats = false;
   {  // sizes alone
     VLA_TRY(const std::unique_ptr<Engine> dry, Engine::load(request.bundle, {.n_thread = request.n_thread,
                                                                              .kernels = request.kernels,
@@ -101,8 +110,10 @@ Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, 
     if (on_cpu) {
       watcher.tell("timing one block of each kind");
       VLA_TRY(predicted, dry->predict());
+      has_floats = dry->precision() != Precision::int8;
     }
   }
+  if (on_cpu && has_floats) checkup.predicted_int8 = predict_int8(request);
   const auto accept = [](const Conditions&) { return Status(); };
   VLA_TRY(checkup.report, measure(request, accept, watcher));
   checkup.cores = median_cores(checkup.report);

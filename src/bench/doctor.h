@@ -40,8 +40,12 @@ struct Checkup {
   double one_thread = 0;             // total on one thread; 0 if not measured
   int horizon = 0;                   // rows of a chunk
   double rate_hz = 0;                // rows per second; 0 if the bundle does not state it
+  double predicted_int8 = 0;         // of the network with large matrices as int8 codes; 0 where that is no choice
   std::size_t predicted_memory = 0;  // bytes
 
+  double predicted() const { return stages.back().predicted; }
+  /// Whether int8 saves enough time to be worth an error.
+  bool gains_by_int8() const { return predicted_int8 > 0 && predicted_int8 < 0.9 * predicted(); }
   /// The faster number of threads: small networks are faster on one.
   double best() const { return one_thread > 0 ? std::min(one_thread, total) : total; }
   /// Rows that the robot executes while the next chunk is computed, which is the shortest replan interval.
@@ -50,9 +54,9 @@ struct Checkup {
   bool holds_rate() const { return rate_hz == 0 || replan_rows() <= horizon; }
 };
 
-/// Predicts from one phase of each kind (Engine::predict), then loads the bundle and measures a few acts, also on one
-/// thread if an act takes less than a quarter of a second. Errors: out_of_memory, before loading, if the policy would
-/// not fit; those of `measure`.
+/// Predicts from one phase of each kind (Engine::predict), also with int8 codes in the place of floats, then loads the
+/// bundle and measures a few acts, also on one thread if an act takes less than a quarter of a second. Errors:
+/// out_of_memory, before loading, if the policy would not fit; those of `measure`.
 Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, const Watcher& watcher);
 
 }  // namespace vla::bench

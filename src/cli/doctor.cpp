@@ -66,9 +66,8 @@ void print_policy(const bench::Checkup& c) {
     say(stdout, "rate      the bundle states none; {:.3g} chunks a second\n", 1e3 / c.best());
 }
 
-/// Prints the settings that matter most. The peaks show what other kernels could gain; what they cost in accuracy is
-/// for the user to measure.
-void print_settings(const bench::Checkup& c, const bench::Machine& machine) {
+/// Prints the settings that matter most. What int8 costs in accuracy is for the user to measure.
+void print_settings(const bench::Checkup& c) {
   if (!c.report.conditions.on_cpu()) return;
   const int n_thread = c.report.conditions.n_thread;
   if (c.one_thread > 0)
@@ -76,14 +75,10 @@ void print_settings(const bench::Checkup& c, const bench::Machine& machine) {
         milliseconds(c.one_thread), milliseconds(c.total), n_thread);
   else
     say(stdout, "settings  --threads {}: cores that the robot's other programs need are better left out\n", n_thread);
-  double int8 = 0;
-  for (const auto& peak : machine.roofs.peaks)
-    if (peak.name.ends_with("int8")) int8 = std::max(int8, peak.all);
-  const double own = machine.roofs.peak(c.report.peak_name);
-  if (c.report.precision == "f32" || c.report.precision == "bf16")
-    if (int8 > own)
-      say(stdout, "          --kernels int8: {:.1f} times the peak of {}, and less exact: docs/quantization.md\n",
-          int8 / own, c.report.peak_name);
+  if (c.gains_by_int8())
+    say(stdout,
+        "          --kernels int8: {} ms of the network predicted instead of {}, less exact: docs/quantization.md\n",
+        milliseconds(c.predicted_int8), milliseconds(c.predicted()));
   if (c.report.conditions.n_view > 1)
     say(stdout, "          fewer views: vision is {:.0f} % of the network, here with {} views\n",
         100 * c.stages.front().measured / c.stages.back().measured, c.report.conditions.n_view);
@@ -119,6 +114,7 @@ Json policy_json(const bench::Checkup& c) {
     json["stages"][stage.name]["predicted_ms"] = stage.predicted > 0 ? Json(stage.predicted) : Json();
   }
   if (c.one_thread > 0) json["one_thread_act_ms"] = c.one_thread;
+  json["int8_predicted_ms"] = c.predicted_int8 > 0 ? Json(c.predicted_int8) : Json();
   json["rate_hz"] = c.rate_hz > 0 ? Json(c.rate_hz) : Json();
   json["horizon"] = c.horizon;
   json["replan_rows"] = c.rate_hz > 0 ? Json(c.replan_rows()) : Json();
@@ -152,7 +148,7 @@ Status doctor(const DoctorOptions& options) {
       verdict = checkup.error();
     } else {
       root["policy"] = policy_json(*checkup);
-      if (!options.json) print_policy(*checkup), print_settings(*checkup, machine);
+      if (!options.json) print_policy(*checkup), print_settings(*checkup);
       if (!checkup->holds_rate())
         verdict = Error{
             Code::late, options.bundle,

@@ -4,6 +4,7 @@
 
 import json
 import os
+import re
 import struct
 
 import pytest
@@ -40,12 +41,19 @@ def test_json_has_machine_build_and_policy(report):
     assert policy["act_ms"] == pytest.approx(network + policy["host_ms"], rel=1e-3)
 
 
+def test_int8_is_named_where_its_prediction_is_a_gain(vla):
+    told = re.findall(r"--kernels int8: ([\d.]+) ms of the network predicted instead of ([\d.]+)", vla("doctor", DEMO, "--threads", 1).out)
+    for int8, own in told:
+        assert float(int8) < 0.9 * float(own) + 0.01
+
+
 @pytest.mark.parametrize("kernels", ["float32", "int8"])
 def test_prediction_and_measurement_agree(vla, kernels):
     if vla.is_sanitized():
         pytest.skip("a sanitizer slows the kernels down")
     policy = vla("doctor", DEMO, "--threads", 1, "--kernels", kernels, "--json").json()["policy"]
     *stages, network = policy["stages"].values()
+    assert (policy["int8_predicted_ms"] is None) == (kernels == "int8")
     assert sum(stage["predicted_ms"] for stage in stages) == pytest.approx(network["predicted_ms"])
     seconds_of_core = network["measured_ms"] * min(1, policy["cores"])  # others may run
     assert seconds_of_core == pytest.approx(network["predicted_ms"], rel=0.4)
