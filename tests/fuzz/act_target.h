@@ -35,9 +35,13 @@ inline bool check_robot(Engine& engine, const Robot& robot) {
     return engine.act(observation, std::uint64_t{1});
   };
   auto chunk = act();
-  int width = 0, height = 0;  // some policies take the images of one camera only
-  if (!chunk && std::sscanf(chunk.error().expected.c_str(), "an image of %d x %d", &width, &height) == 2)
-    chunk = act(width, height);
+  // Some policies take the images of one camera or of one aspect only, which roundings between two sizes may change.
+  for (const char* expected : {"an image of %d x %d", "an image with the aspect of %d x %d"})
+    for (const int wider : {0, -1}) {
+      int width = 0, height = 0;
+      if (!chunk && std::sscanf(chunk.error().expected.c_str(), expected, &width, &height) == 2)
+        chunk = act(width + wider, height);
+    }
   if (!chunk) {
     const Code code = chunk.error().code;
     if (code != Code::bad_observation && code != Code::bad_action && code != Code::unsupported)
