@@ -121,11 +121,11 @@ struct NeonTile {
   }
 };
 
-bool supports(const MatrixDesc& desc, Features use) { return use.has(Feature::neon) && is_float(desc.type); }
+bool supports_neon(const MatrixDesc& desc, Features use) { return use.has(Feature::neon) && is_float(desc.type); }
 
 }  // namespace
 
 extern const LinearKernel kLinearNeon;
-const LinearKernel kLinearNeon = LinearLoop<NeonTile>::kernel("neon", supports);
+const LinearKernel kLinearNeon = LinearLoop<NeonTile>::kernel("neon", supports_neon);
 
 }  // namespace vla::kernels
