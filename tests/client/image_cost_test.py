@@ -12,7 +12,7 @@ from server_process import Server
 
 MOST_SECONDS = 0.4  # of the processor: 0.2 s on a quiet machine, whose cores share nothing
 REFUSED_SECONDS = 0.1  # most of it is the receipt of 33 MB
-FAMILIES = "gr00t_n1_6/aspect", "bitvla/one_view"  # images of any size; the first averages, the second filters
+FAMILIES = "gr00t_n1_6/libero", "bitvla/one_view"  # images of any size; the first averages, the second filters
 
 
 @pytest.fixture(scope="module")

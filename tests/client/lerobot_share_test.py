@@ -96,7 +96,7 @@ def test_a_peer_with_many_connections_gets_a_robots_turns_only():
                 others += sum(counts) - before
             stop.set()
             [thread.join() for thread in threads]
-        assert others <= 12 * n_act, others  # with a turn for each connection it would be twice as many
+        assert others <= 18 * n_act, others  # with a turn for each connection it would be 24 and more, this client being busy
 
 
 def test_observations_that_nobody_asks_for_are_forgotten_before_they_are_too_much(case):
