@@ -27,10 +27,9 @@ namespace vla::serve {
 /// came long before them, or after. Where the queue is full, the peer that has most in it gives way to one that has
 /// less, and then within the peer the generation that has most.
 ///
-/// Before whoever's turn it is comes a peer, or in a crowd a generation, that connected earlier and had fewer of the
-/// last `kRecent` turns: robots that were there before a flood, and that ask for less than half of what the server
-/// computes, wait for the act that is being computed, and for none of the flood's that wait. Those who came later
-/// cannot do so, and nobody waits for more than `kRecent` turns beyond its place in line.
+/// A peer (in a crowd, a generation) goes first if it connected earlier and had fewer of the last `kRecent` turns. So
+/// robots that connected before a flood, and ask for less than half of what the server computes, wait only for the act
+/// in progress. Later connections never go first, and nobody waits more than `kRecent` turns beyond its place in line.
 ///
 /// `Job` has `client` (std::string), `share` (net::Share), `deadline` (std::optional<Clock::time_point>) and `size`
 /// (bytes). The queue knows no clock and takes no lock.

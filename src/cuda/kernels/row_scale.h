@@ -26,10 +26,10 @@ VLA_DEVICE bool is_plain(float x) {
   constexpr unsigned kLeast = 127 - 40, kRange = 80;
   return (static_cast<unsigned>(dev::bits_of(x)) >> 23 & 255) - kLeast <= kRange;
 }
-/// a / b as a division rounds it, of plain numbers (a may be 0) and the reciprocal of b as a division rounds that.
-/// After the first correction the quotient is one of the two floats around a / b; a fused remainder is exact and a
-/// further correction then rounds right (P. Markstein, IBM Journal of Research and Development 34, 1990). Unlike a
-/// division it has no branch, of which an epilogue of a division for each sum spent most of its time.
+/// Returns a / b, rounded as a division rounds it. a and b are plain, or a is 0; reciprocal is 1 / b, rounded. The
+/// first correction gives one of the two floats around a / b. Its remainder is exact by FMA, so the second correction
+/// rounds right (P. Markstein, IBM Journal of Research and Development 34, 1990). A division branches, and an epilogue
+/// that divides for each sum spends most of its time there.
 VLA_DEVICE float quotient(float a, float b, float reciprocal) {
   float q = dev::multiply(a, reciprocal);
   q = dev::multiply_add(dev::multiply_add(-b, q, a), reciprocal, q);

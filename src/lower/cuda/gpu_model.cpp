@@ -14,6 +14,22 @@ constexpr double kTera = 1e12, kGiga = 1e9, kMicro = 1e-6;
 // Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202, H100 and H200. Two figures are from memory
 // of published reports and were never checked: mma.sync reaches 0.62 of the H100's tensor units; and the time of a
 // launch in a graph, but for Hopper's: of small kernels of acts on an H200, begun before the kernel before them ends.
+
+/// H100 and H200 differ in their memory alone.
+constexpr GpuModel hopper(const char* name, const char* description, double bandwidth) {
+  return {.name = name,
+          .description = description,
+          .n_sm = 132,
+          .is_hopper = true,
+          .clock = 1.83 * kGiga,
+          .bf16 = 0.62 * 989 * kTera,
+          .int8 = 0.62 * 1979 * kTera,
+          .f32 = 66.9 * kTera,
+          .dot4 = 133.8 * kTera,
+          .bandwidth = bandwidth,
+          .shared = 228 << 10,
+          .launch = 2.5 * kMicro};
+}
 constexpr GpuModel kModels[] = {
     {.name = "orin-agx",
      .description = "Jetson AGX Orin 64 GB, 16 SMs at 1.3 GHz",
@@ -48,30 +64,8 @@ constexpr GpuModel kModels[] = {
      .bandwidth = 1792 * kGiga,
      .shared = 100 << 10,
      .launch = 1.0 * kMicro},
-    {.name = "h100",
-     .description = "H100 SXM 80 GB, 132 SMs at 1.83 GHz",
-     .n_sm = 132,
-     .is_hopper = true,
-     .clock = 1.83 * kGiga,
-     .bf16 = 0.62 * 989 * kTera,
-     .int8 = 0.62 * 1979 * kTera,
-     .f32 = 66.9 * kTera,
-     .dot4 = 133.8 * kTera,
-     .bandwidth = 3350 * kGiga,
-     .shared = 228 << 10,
-     .launch = 2.5 * kMicro},
-    {.name = "h200",
-     .description = "H200 SXM 141 GB, 132 SMs at 1.83 GHz",
-     .n_sm = 132,
-     .is_hopper = true,
-     .clock = 1.83 * kGiga,
-     .bf16 = 0.62 * 989 * kTera,
-     .int8 = 0.62 * 1979 * kTera,
-     .f32 = 66.9 * kTera,
-     .dot4 = 133.8 * kTera,
-     .bandwidth = 4800 * kGiga,
-     .shared = 228 << 10,
-     .launch = 2.5 * kMicro},
+    hopper("h100", "H100 SXM 80 GB, 132 SMs at 1.83 GHz", 3350 * kGiga),
+    hopper("h200", "H200 SXM 141 GB, 132 SMs at 1.83 GHz", 4800 * kGiga),
 };
 
 // Of other GPUs, assumed and never measured: the fraction of issue slots that a quarter of an SM fills when nothing
