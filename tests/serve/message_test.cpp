@@ -102,7 +102,8 @@ TEST_CASE("what a message announces takes no memory before it came") {
 
 TEST_CASE("texts are bounded together, and each before its bytes are looked at") {
   const auto list_of = [](std::size_t n, char letter) {
-    const std::string text = std::string("\xdb\0\x10\0\0", 5) + std::string(1 << 20, letter);
+    std::string text("\xdb\0\x10\0\0", 5);
+    text.append(1 << 20, letter);
     std::string message(1, static_cast<char>(0x90 + n));
     for (std::size_t i = 0; i < n; ++i) message += text;
     return message;
