@@ -19,6 +19,13 @@ struct Windows {
   std::vector<Window> list;
 };
 
+/// A filter as a function of the distance, which reaches `support` far, and whether it is torch's.
+struct Filter {
+  double (*weight)(double);
+  double support;
+  bool torch;
+};
+
 double triangle(double distance) { return distance < 1.0 ? 1.0 - distance : 0.0; }
 
 double cubic(double x) {
@@ -27,23 +34,24 @@ double cubic(double x) {
   return x < 2.0 ? (((x - 5.0) * x + 8.0) * x - 4.0) * a : 0.0;
 }
 
+constexpr Filter kBilinear = {triangle, 1.0, false}, kBicubic = {cubic, 2.0, false}, kTorch = {cubic, 2.0, true};
+
 int rounded_weight(double weight, int bits) {
   return static_cast<int>((weight < 0.0 ? -0.5 : 0.5) + weight * (1 << bits));
 }
 
 /// Fraction bits of weights: 32 bits minus 8 for a pixel and 2 of headroom. torch stores weights in 16 bits.
-int weight_bits(double largest, ByteFilter filter) {
+int weight_bits(double largest, const Filter& filter) {
   constexpr int kBits = 22;
-  if (filter != ByteFilter::torch_bicubic) return kBits;
+  if (!filter.torch) return kBits;
   int bits = 0;
   while (bits < kBits && rounded_weight(largest, bits + 1) < 1 << 15) ++bits;
   return bits;
 }
 
-Windows make_windows(int n_in, int n_out, ByteFilter filter) {
-  const bool wide = filter != ByteFilter::pillow_bilinear;
+Windows make_windows(int n_in, int n_out, const Filter& filter) {
   const double scale = static_cast<double>(n_in) / n_out, widened = std::max(scale, 1.0);
-  const double support = (wide ? 2.0 : 1.0) * widened;  // half of the filter's width
+  const double support = filter.support * widened;  // half of the filter's width
   std::vector<std::vector<double>> exact;
   Windows windows{0, {}};
   double largest = 0.0;
@@ -55,7 +63,7 @@ Windows make_windows(int n_in, int n_out, ByteFilter filter) {
     double sum = 0.0;
     for (int x = first; x < end; ++x) {
       const double distance = std::abs((x - center + 0.5) * (1.0 / widened));
-      weights.push_back(wide ? cubic(distance) : triangle(distance));
+      weights.push_back(filter.weight(distance));
       sum += weights.back();
     }
     for (double& weight : weights) {
@@ -108,7 +116,7 @@ Pixels empty(int width, int height) {
   return {width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * 3 * height)};
 }
 
-Pixels with_width(Pixels from, int width, ByteFilter filter) {
+Pixels with_width(Pixels from, int width, const Filter& filter) {
   if (width == from.width) return from;
   Pixels to = empty(width, from.height);
   resample_axis(from.rgb.data(), {from.height, 3, from.row_size()}, to.rgb.data(), {from.height, 3, to.row_size()},
@@ -116,7 +124,7 @@ Pixels with_width(Pixels from, int width, ByteFilter filter) {
   return to;
 }
 
-Pixels with_height(Pixels from, int height, ByteFilter filter) {
+Pixels with_height(Pixels from, int height, const Filter& filter) {
   if (height == from.height) return from;
   Pixels to = empty(from.width, height);
   resample_axis(from.rgb.data(), {from.width, from.row_size(), 3}, to.rgb.data(), {from.width, from.row_size(), 3},
@@ -126,20 +134,35 @@ Pixels with_height(Pixels from, int height, ByteFilter filter) {
 
 /// Pillow 13.0 reorders the passes to save work, which changes bytes because the first sums are rounded. Earlier
 /// releases and torch always sum rows first.
-bool columns_come_first(int width, int height, int to_width, int to_height, ByteFilter filter) {
-  return filter != ByteFilter::torch_bicubic && height - to_height > 2 * std::max(width - to_width, 0);
+bool columns_come_first(int width, int height, int to_width, int to_height, const Filter& filter) {
+  return !filter.torch && height - to_height > 2 * std::max(width - to_width, 0);
 }
 
-}  // namespace
-
-std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
-                                        int to_height, ByteFilter filter) {
+std::vector<std::uint8_t> resample(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                   int to_height, const Filter& filter) {
   Pixels image{width, height, {rgb.begin(), rgb.end()}};
   const bool columns_first = columns_come_first(width, height, to_width, to_height, filter);
   if (columns_first) image = with_height(std::move(image), to_height, filter);
   image = with_width(std::move(image), to_width, filter);
   if (!columns_first) image = with_height(std::move(image), to_height, filter);
   return std::move(image.rgb);
+}
+
+}  // namespace
+
+std::vector<std::uint8_t> resample_pillow_bilinear(std::span<const std::uint8_t> rgb, int width, int height,
+                                                   int to_width, int to_height) {
+  return resample(rgb, width, height, to_width, to_height, kBilinear);
+}
+
+std::vector<std::uint8_t> resample_pillow_bicubic(std::span<const std::uint8_t> rgb, int width, int height,
+                                                  int to_width, int to_height) {
+  return resample(rgb, width, height, to_width, to_height, kBicubic);
+}
+
+std::vector<std::uint8_t> resample_torch_16bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                               int to_height) {
+  return resample(rgb, width, height, to_width, to_height, kTorch);
 }
 
 }  // namespace vla

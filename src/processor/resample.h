@@ -8,16 +8,19 @@
 
 namespace vla {
 
-/// Integer resampling of bytes with a filter that widens when an image shrinks (antialiasing): a triangle or Keys'
-/// cubic with a = -0.5. Weights have 22 binary digits, or as many as 16 bits hold.
-enum class ByteFilter { pillow_bilinear, pillow_bicubic, torch_bicubic };
+/// An RGB image of interleaved bytes at another size, equal to the bit to Pillow 13.0's: with a filter that widens when
+/// the image shrinks (antialiasing), a triangle or Keys' cubic with a = -0.5, and integer weights of 22 binary digits.
+/// Rows are rounded to bytes before columns are summed; the other way round if the image loses more than twice as many
+/// rows as columns. All sizes must be at least 1. Source: Pillow src/libImaging/Resample.c.
+std::vector<std::uint8_t> resample_pillow_bilinear(std::span<const std::uint8_t> rgb, int width, int height,
+                                                   int to_width, int to_height);
+std::vector<std::uint8_t> resample_pillow_bicubic(std::span<const std::uint8_t> rgb, int width, int height,
+                                                  int to_width, int to_height);
 
-/// An RGB image of interleaved bytes at another size, equal to the bit to Pillow 13.0's or to torchvision's resize of
-/// an 8-bit tensor (transforms.v2, torch 2.13). Rows are rounded to bytes before columns are summed, or the other way
-/// round where Pillow does so: if the image loses more than twice as many rows as columns. All sizes must be at
-/// least 1. Sources: Pillow src/libImaging/Resample.c; torch aten/src/ATen/native/cpu/UpSampleKernelAVXAntialias.h.
-std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
-                                        int to_height, ByteFilter filter = ByteFilter::pillow_bilinear);
+/// The same by torchvision's resize of an 8-bit tensor (transforms.v2, torch 2.13): weights have as many digits as 16
+/// bits hold, rows always come first. Source: torch aten/src/ATen/native/cpu/UpSampleKernelAVXAntialias.h.
+std::vector<std::uint8_t> resample_torch_16bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                               int to_height);
 
 /// The same by OpenCV's cv::resize with INTER_LINEAR (4.10 and 5.0 agree): no antialiasing, weights of 11 binary
 /// digits, and the mean of four pixels where both sides are halved. Source: OpenCV modules/imgproc/src/resize.cpp.
@@ -48,7 +51,7 @@ std::vector<float> resample_torch_cubic(std::vector<float> rgb, int width, int h
 
 /// Float pixels by areas: the mean of every pixel that an output pixel touches, each with the same weight. Source:
 /// torch F.interpolate(mode="area"), aten/src/ATen/native/cpu/AdaptiveAvgPoolKernel.cpp.
-std::vector<float> resample_torch_area(std::span<const float> rgb, int width, int height, int to_width, int to_height);
+std::vector<float> resample_torch_area(std::vector<float> rgb, int width, int height, int to_width, int to_height);
 
 /// Bytes by tf.image.resize with lanczos3 and antialiasing (TensorFlow 2.18): rows first, summed in float32, rounded
 /// half to even. Sources: tensorflow core/kernels/image/scale_and_translate_op.cc, sampling_kernels.h.

@@ -159,6 +159,7 @@ auto resample(std::vector<float> pixels, int width, int height, int to_width, in
 
 std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                          int to_height) {
+  if (width == to_width && height == to_height) return {rgb.begin(), rgb.end()};
   return resample({rgb.begin(), rgb.end()}, width, height, to_width, to_height, kCubic, rounded);
 }
 
@@ -175,7 +176,7 @@ std::vector<float> resample_torch_cubic(std::vector<float> rgb, int width, int h
   return resample(std::move(rgb), width, height, to_width, to_height, kCubic, [](float x) { return x; });
 }
 
-std::vector<float> resample_torch_area(std::span<const float> rgb, int width, int height, int to_width, int to_height) {
+std::vector<float> resample_torch_area(std::vector<float> rgb, int width, int height, int to_width, int to_height) {
   struct Stretch {
     std::int64_t first, end;
   };

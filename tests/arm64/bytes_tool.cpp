@@ -43,9 +43,9 @@ void say_pixels(Numbers& numbers) {
   for (std::uint8_t& byte : rgb) byte = static_cast<std::uint8_t>(numbers.uniform() * 256);
   for (const auto& [w, h] : {std::pair{96, 96}, {224, 224}, {61, 200}, {400, 37}}) {
     std::printf("to %d x %d\n", w, h);
-    say("Pillow, bilinear", resample_8bit(rgb, kWidth, kHeight, w, h, ByteFilter::pillow_bilinear));
-    say("Pillow, bicubic", resample_8bit(rgb, kWidth, kHeight, w, h, ByteFilter::pillow_bicubic));
-    say("torch, bicubic of bytes", resample_8bit(rgb, kWidth, kHeight, w, h, ByteFilter::torch_bicubic));
+    say("Pillow, bilinear", resample_pillow_bilinear(rgb, kWidth, kHeight, w, h));
+    say("Pillow, bicubic", resample_pillow_bicubic(rgb, kWidth, kHeight, w, h));
+    say("torch, bicubic of bytes", resample_torch_16bit(rgb, kWidth, kHeight, w, h));
     say("OpenCV, linear", resample_opencv(rgb, kWidth, kHeight, w, h));
     say("OpenCV, area", resample_opencv_area(rgb, kWidth, kHeight, w, h));
     say("torch, bicubic", resample_torch(rgb, kWidth, kHeight, w, h));

@@ -284,9 +284,9 @@ TEST_CASE("bicubic resizes of bytes are those of Pillow and of torchvision, whos
   std::vector<std::uint8_t> expected = {17,  70, 127, 91,  150, 186, 170, 230, 35,  81,  153, 190, 178, 125, 86,
                                         152, 87, 81,  163, 157, 124, 120, 79,  79,  109, 87,  167, 148, 107, 69,
                                         50,  92, 152, 115, 148, 167, 32,  90,  151, 115, 179, 201, 190, 119, 49};
-  CHECK(resample_8bit(colours(), 6, 4, 3, 5, ByteFilter::pillow_bicubic) == expected);
+  CHECK(resample_pillow_bicubic(colours(), 6, 4, 3, 5) == expected);
   expected[1] = 69;
-  CHECK(resample_8bit(colours(), 6, 4, 3, 5, ByteFilter::torch_bicubic) == expected);
+  CHECK(resample_torch_16bit(colours(), 6, 4, 3, 5) == expected);
 }
 
 TEST_CASE("a sliver of an image is refused before it is padded or scaled") {
@@ -340,6 +340,26 @@ TEST_CASE("a frame of another aspect is refused, also where images are resized t
   CHECK(refusal_of(*wide, 320, 240).empty());
   CHECK(contains(refusal_of(*wide, 480, 640), "which becomes 16 x 21"));
   CHECK(contains(refusal_of(*wide, 1280, 720), "which becomes 28 x 16"));
+}
+
+TEST_CASE("every filter on bytes resizes frames and images alike, and planes are made of frames alone") {
+  for (const char* filter : {"opencv_bilinear", "torch_bicubic_8bit", "pillow_bicubic", "torch_bicubic_16bit"}) {
+    CAPTURE(filter);
+    const Json resize = {{"op", "resize"}, {"width", 3}, {"height", 5}, {"filter", filter}};
+    const Json size = {{"op", "size"}, {"width", 3}, {"height", 5}};
+    const auto first = parse_recipe(with("/image", Json::array({resize})).dump());
+    const Json kept = {{"op", "crop_fraction"}, {"fraction", 1}};
+    const auto second = parse_recipe(with("/image", Json::array({kept, resize, size})).dump());
+    REQUIRE_MESSAGE(first.ok(), first.error().message());
+    REQUIRE_MESSAGE(second.ok(), second.error().message());
+    std::vector<float> of_frame(45, -1.0f), of_image(45, -2.0f);
+    CHECK(first->fit->apply({6, 4, colours()}, of_frame, "view").ok());
+    CHECK(second->fit->apply({6, 4, colours()}, of_image, "view").ok());
+    CHECK(of_frame == of_image);
+  }
+  const Json planes = {{"op", "resize"}, {"width", 3}, {"height", 5}, {"filter", "torch_bilinear"}};
+  const auto late = parse_recipe(with("/image", Json::array({{{"op", "square_pad"}}, planes})).dump());
+  CHECK(contains(refusal(late, Code::bad_bundle), "image[1].filter: expected a filter on bytes"));
 }
 
 TEST_CASE("a resize that would squeeze the frames of any camera is refused with the bundle") {

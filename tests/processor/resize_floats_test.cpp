@@ -13,7 +13,8 @@ using Json = nlohmann::json;
 
 namespace {
 
-using Filter = FloatResize::Filter;
+const ResizeFilter* const kArea = find_resize_filter("resize_floats", "area");
+const ResizeFilter* const kBicubic = find_resize_filter("resize_floats", "bicubic");
 
 std::vector<float> resized(const Frame& frame, const FloatResizes& to) {
   std::vector<float> out(static_cast<std::size_t>(3 * to.sizes.back().width * to.sizes.back().height), NAN);
@@ -49,8 +50,8 @@ TEST_CASE("areas that overlap are averaged, and a bicubic enlargement follows in
                                     0.33942074f, 0.35289466f, 0.38141048f, 0.41193128f, 0.44044712f, 0.45392102f,
                                     0.37133712f, 0.38572833f, 0.41618538f, 0.44878396f, 0.47924101f, 0.49363217f};
   for (const Frame& given : {frame, as_floats(frame)}) {
-    check_plane(resized(given, {{}, {{3, 3, Filter::area}}}), 1, areas);
-    check_plane(resized(given, {{}, {{3, 3, Filter::area}, {6, 4, Filter::bicubic}}}), 2, twice);
+    check_plane(resized(given, {{}, {{3, 3, kArea}}}), 1, areas);
+    check_plane(resized(given, {{}, {{3, 3, kArea}, {6, 4, kBicubic}}}), 2, twice);
   }
 }
 
@@ -58,14 +59,14 @@ TEST_CASE("a bicubic edge overshoots and is not clamped") {
   std::vector<float> rgb;
   for (int row = 0; row < 2; ++row)
     for (const float x : {0.0f, 0.0f, 1.0f, 1.0f}) rgb.insert(rgb.end(), 3, x);
-  const std::vector<float> out = resized({4, 2, rgb}, {{}, {{8, 2, Filter::bicubic}}});
+  const std::vector<float> out = resized({4, 2, rgb}, {{}, {{8, 2, kBicubic}}});
   CHECK(out[2] == doctest::Approx(-0.06870229f).epsilon(1e-6));
   CHECK(out[5] == doctest::Approx(1.06870234f).epsilon(1e-6));
 }
 
 TEST_CASE("a frame that has the size passes as it is") {
   const Frame frame = frame_of(4, 3);
-  const std::vector<float> out = resized(frame, {CameraSize{4, 3}, {{4, 3, Filter::area}, {4, 3, Filter::bicubic}}});
+  const std::vector<float> out = resized(frame, {CameraSize{4, 3}, {{4, 3, kArea}, {4, 3, kBicubic}}});
   const auto& bytes = std::get<std::vector<std::uint8_t>>(frame.rgb);
   for (std::size_t i = 0; i < 12; ++i) CHECK(out[12 + i] == static_cast<float>(bytes[3 * i + 1]) / 255.0f);
 }

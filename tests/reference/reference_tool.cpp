@@ -3,10 +3,10 @@
 //
 // The processor's pure functions behind a pipe, for the comparison scripts of this folder.
 //   reference_tool tokenize KEYS.json      stdin: u32 length, text, ...         stdout: u32 count, i32 ids, ...
-//   reference_tool image WIDTH HEIGHT [center | pillow | opencv | torch]
+//   reference_tool image WIDTH HEIGHT [center | pillow | FILTER]
 //                                          stdin: u32 length, image file, ...   stdout: u32 count, f32 pixels, ...
-// KEYS.json holds the tokenizer.* keys of a bundle as one JSON object. An input that is refused gives count 0 and a
-// line on stderr.
+// FILTER is one of the recipe's op "resize". KEYS.json holds the tokenizer.* keys of a bundle as one JSON object. An
+// input that is refused gives count 0 and a line on stderr.
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -52,9 +52,8 @@ int tokenize(const char* path) {
 }
 
 vla::Status fit(const vla::Frame& frame, int width, int height, const std::string& how, std::span<float> out) {
-  using Filter = vla::Resize::Filter;
-  if (how == "opencv") return vla::resize(frame, {width, height, Filter::opencv_bilinear}, out, "stdin");
-  if (how == "torch") return vla::resize(frame, {width, height, Filter::torch_bicubic_8bit}, out, "stdin");
+  if (const auto* filter = vla::find_resize_filter("resize", how))
+    return vla::resize(frame, {width, height, filter}, out, "stdin");
   vla::Letterbox box;
   box.width = width;
   box.height = height;
@@ -84,7 +83,6 @@ int main(int argc, char** argv) {
   if (argc == 3 && std::strcmp(argv[1], "tokenize") == 0) return tokenize(argv[2]);
   if ((argc == 4 || argc == 5) && std::strcmp(argv[1], "image") == 0)
     return image(std::atoi(argv[2]), std::atoi(argv[3]), argc == 5 ? argv[4] : "");
-  std::fputs("usage: reference_tool tokenize KEYS.json | image WIDTH HEIGHT [center | pillow | opencv | torch]\n",
-             stderr);
+  std::fputs("usage: reference_tool tokenize KEYS.json | image WIDTH HEIGHT [center | pillow | FILTER]\n", stderr);
   return 2;
 }

@@ -119,7 +119,7 @@ std::vector<std::uint8_t> resized_8bit(const Frame& frame, const Target& target)
   const auto* given = std::get_if<std::vector<std::uint8_t>>(&frame.rgb);
   std::vector<std::uint8_t> bytes = given != nullptr ? *given : cut_to_bytes(std::get<std::vector<float>>(frame.rgb));
   if (frame.width == target.width && frame.height == target.height) return bytes;
-  return resample_8bit(bytes, frame.width, frame.height, target.width, target.height);
+  return resample_pillow_bilinear(bytes, frame.width, frame.height, target.width, target.height);
 }
 
 void place(const Frame& frame, const Target& target) {

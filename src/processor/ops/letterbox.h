@@ -32,7 +32,7 @@ struct Letterbox {
 /// align_corners=False).
 ///
 /// With `antialias` everything happens in 8 bits, and a float frame is first cut to them (255 x, without rounding); the
-/// result equals Pillow's. Source: openpi image_tools.py resize_with_pad; `resample_8bit`.
+/// result equals Pillow's. Source: openpi image_tools.py resize_with_pad; `resample_pillow_bilinear`.
 ///
 /// Errors: bad_observation when a side of the resized image is shorter than a pixel.
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where);

@@ -22,6 +22,7 @@ namespace vla {
 class JsonFields;
 
 struct Recipe;
+struct Resize;
 
 /// A line of the table.
 struct OpEntry {
@@ -45,6 +46,8 @@ class Fit {
   virtual const char* described() const = 0;
   /// The only frames that are taken, where the recipe says so.
   virtual std::optional<CameraSize> camera_size() const { return {}; }
+  /// The sizes of its resizes in floats, behind which more may follow; null of any other fit.
+  virtual std::vector<Resize>* float_sizes() { return nullptr; }
   /// What it computes beside making the planes, for a frame of this size, in pixels of about 10 ns.
   virtual std::int64_t work(int /*width*/, int /*height*/) const { return 0; }
   /// Writes (3, height, width) float32 in [0, 1]. Errors: bad_observation, at `where`.
@@ -84,6 +87,8 @@ class PlaneOp {
 class TextOp {
  public:
   virtual ~TextOp() = default;
+  /// Whether it refuses instructions and changes none.
+  virtual bool refuses() const { return false; }
   /// `state`: the discretized state, for prompts that include it. Errors: bad_observation.
   virtual Result<std::string> apply(std::string text, std::span<const int> state) const = 0;
 };

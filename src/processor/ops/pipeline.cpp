@@ -62,18 +62,6 @@ Image cropped(const Image& from, const CenterCrop& op) {
   return to;
 }
 
-std::vector<std::uint8_t> resized(const Image& from, const ByteResize& op) {
-  switch (op.filter) {
-    case ByteResize::Filter::pillow_bicubic:
-      return resample_8bit(from.rgb, from.width, from.height, op.width, op.height, ByteFilter::pillow_bicubic);
-    case ByteResize::Filter::torch_bicubic_16bit:
-      return resample_8bit(from.rgb, from.width, from.height, op.width, op.height, ByteFilter::torch_bicubic);
-    case ByteResize::Filter::torch_bilinear_cut:
-      break;
-  }
-  return resample_torch_linear(from.rgb, from.width, from.height, op.width, op.height);
-}
-
 /// The image in the middle of another size: what is beyond it is cut off, what it does not reach is black.
 Image centred(const Image& from, int width, int height) {
   Image to{width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * height * 3)};
@@ -103,7 +91,9 @@ Image applied(const ByteOp& op, const Image& from, int width, int height) {
     return {width, height, codecs::through_jpeg(from.rgb, width, height, jpeg->quality)};
   if (std::holds_alternative<SmallestSide>(op))
     return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
-  if (const auto* resize = std::get_if<ByteResize>(&op)) return {width, height, resized(from, *resize)};
+  if (const auto* resize = std::get_if<Resize>(&op))
+    return {width, height,
+            std::get<ResizeBytes>(resize->filter->resize)(from.rgb, from.width, from.height, width, height)};
   if (std::holds_alternative<ExpectSize>(op)) return from;
   if (const auto* crop = std::get_if<CenterCrop>(&op)) return cropped(from, *crop);
   if (const auto* crop = std::get_if<CropAndResize>(&op))
@@ -226,7 +216,7 @@ Status parse_square_pad(JsonFields& fields, Recipe& recipe) { return add(fields,
 Status parse_smallest_side(JsonFields& fields, Recipe& recipe) {
   SmallestSide op;
   VLA_TRY(op.size, fields.integer("size", 1, kMaxImageSide));
-  VLA_CHECK(fields.choice("filter", {"opencv_area"}));
+  VLA_CHECK(read_resize_filter(fields, "smallest_side"));
   return add(fields, recipe, op);
 }
 
@@ -279,11 +269,8 @@ Status parse_byte_resize(JsonFields& fields, Recipe& recipe) {
   if (has_any_aspect(*pipeline))
     return misplaced(fields,
                      "images of one aspect: a smallest_side keeps that of every frame, which resize would squeeze");
-  ByteResize op;
-  VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
-  VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));
-  VLA_TRY(const int filter, fields.choice("filter", {"pillow_bicubic", "torch_bicubic_16bit", "torch_bilinear_cut"}));
-  op.filter = static_cast<ByteResize::Filter>(filter);
+  VLA_TRY(const Resize op, read_resize(fields, "resize"));
+  if (!std::holds_alternative<ResizeBytes>(op.filter->resize)) return fields.wrong("filter", "a filter on bytes");
   return add(fields, recipe, op);
 }
 

@@ -11,6 +11,7 @@
 #include "base/result.h"
 #include "processor/image.h"
 #include "processor/ops/op.h"
+#include "processor/ops/resize.h"
 
 namespace vla {
 
@@ -25,15 +26,6 @@ struct SmallestSide {
 /// The middle of an image: this fraction of each side, cut to whole pixels, but one pixel at least.
 struct CropFraction {
   double fraction = 0.0;
-};
-
-/// A size, without keeping the aspect ratio.
-struct ByteResize {
-  enum class Filter { pillow_bicubic, torch_bicubic_16bit, torch_bilinear_cut };
-
-  int width = 0;
-  int height = 0;
-  Filter filter = Filter::pillow_bicubic;
 };
 
 /// Images of one size alone, which follows from the aspect of the camera's frames.
@@ -66,7 +58,7 @@ struct JpegRoundTrip {
   int quality = 0;
 };
 
-using ByteOp = std::variant<JpegRoundTrip, SquarePad, SmallestSide, CropFraction, ByteResize, ExpectSize, CameraSize,
+using ByteOp = std::variant<JpegRoundTrip, SquarePad, SmallestSide, CropFraction, Resize, ExpectSize, CameraSize,
                             CenterCrop, Lanczos3, CropAndResize>;
 
 /// Ops on 8-bit images in order, and the size that the last one must leave.
@@ -87,7 +79,7 @@ Status check_camera(const Frame& frame, const CameraSize& camera, const std::str
 /// Half a pixel for each that an op reads.
 std::int64_t pipeline_work(const Pipeline& pipeline, int width, int height);
 
-/// The op "resize" among others.
+/// The op "resize" among others, by a filter on bytes.
 Status parse_byte_resize(JsonFields& fields, Recipe& recipe);
 
 }  // namespace vla

@@ -4,50 +4,43 @@
 
 #include "processor/byte_pixels.h"
 #include "processor/json_fields.h"
-#include "processor/ops/letterbox.h"
 #include "processor/ops/pipeline.h"
 #include "processor/recipe.h"
-#include "processor/resample.h"
 
 namespace vla {
 
+Result<Resize> read_resize(JsonFields& fields, std::string_view op) {
+  constexpr int kMinSide = 2;
+  Resize resize;
+  VLA_TRY(resize.width, fields.integer("width", kMinSide, kMaxImageSide));
+  VLA_TRY(resize.height, fields.integer("height", kMinSide, kMaxImageSide));
+  VLA_TRY(resize.filter, read_resize_filter(fields, op));
+  return resize;
+}
+
 Status resize(const Frame& frame, const Resize& to, std::span<float> out, const std::string& where) {
-  if (to.filter == Resize::Filter::torch_bilinear) return stretch(frame, to.width, to.height, out), Status();
-  const bool opencv = to.filter == Resize::Filter::opencv_bilinear;
+  if (const auto* planes = std::get_if<ResizeToPlanes>(&to.filter->resize))
+    return (*planes)(frame, to.width, to.height, out), Status();
   std::vector<std::uint8_t> cut;
   const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb);
   if (bytes == nullptr) {
-    if (opencv)
+    if (!to.filter->cuts_floats)
       return Error{Code::bad_observation, where, "pixels of 8 bits", "float pixels",
                    "send the camera's bytes: this policy's images are resized as bytes"};
     cut = cut_to_bytes(std::get<std::vector<float>>(frame.rgb));
     bytes = &cut;
   }
-  if (frame.width == to.width && frame.height == to.height) {
-    spread_bytes(*bytes, out);
-    return {};
-  }
-  const auto resample = opencv ? resample_opencv : resample_torch;
+  const auto resample = std::get<ResizeBytes>(to.filter->resize);
   spread_bytes(resample(*bytes, frame.width, frame.height, to.width, to.height), out);
   return {};
 }
 
 namespace {
 
-Result<Resize> read_resize(JsonFields& fields) {
-  constexpr int kMinSide = 2;  // torch reads the wrong rows of an image with one column
-  Resize op;
-  VLA_TRY(op.width, fields.integer("width", kMinSide, kMaxImageSide));
-  VLA_TRY(op.height, fields.integer("height", kMinSide, kMaxImageSide));
-  VLA_TRY(const int filter, fields.choice("filter", {"opencv_bilinear", "torch_bicubic_8bit", "torch_bilinear"}));
-  op.filter = static_cast<Resize::Filter>(filter);
-  return op;
-}
-
-/// As the first op it makes the planes; later in the list it is one of several ops on bytes.
+/// Makes the planes as the first op; after others it is one of several ops on bytes.
 Status parse(JsonFields& fields, Recipe& recipe) {
   if (recipe.fit != nullptr) return parse_byte_resize(fields, recipe);
-  VLA_TRY(const Resize op, read_resize(fields));
+  VLA_TRY(const Resize op, read_resize(fields, "resize"));
   recipe.fit = std::make_unique<OneFit<Resize>>("resized", resize, op);
   recipe.width = op.width;
   recipe.height = op.height;

@@ -8,7 +8,6 @@
 #include "processor/json_fields.h"
 #include "processor/ops/pipeline.h"
 #include "processor/recipe.h"
-#include "processor/resample.h"
 
 namespace vla {
 namespace {
@@ -26,11 +25,10 @@ Status resize_floats(const Frame& frame, const FloatResizes& to, std::span<float
   if (to.camera) VLA_CHECK(check_camera(frame, *to.camera, where));
   std::vector<float> pixels = float_pixels(frame);
   int width = frame.width, height = frame.height;
-  for (const FloatResize& size : to.sizes) {
+  for (const Resize& size : to.sizes) {
     if (size.width == width && size.height == height) continue;
-    pixels = size.filter == FloatResize::Filter::area
-                 ? resample_torch_area(pixels, width, height, size.width, size.height)
-                 : resample_torch_cubic(std::move(pixels), width, height, size.width, size.height);
+    const auto resample = std::get<ResizeFloats>(size.filter->resize);
+    pixels = resample(std::move(pixels), width, height, size.width, size.height);
     width = size.width;
     height = size.height;
   }
@@ -42,20 +40,17 @@ Status resize_floats(const Frame& frame, const FloatResizes& to, std::span<float
 
 namespace {
 
-constexpr int kMinSide = 2;  // torch reads the wrong rows of an image with one column
+constexpr int kMinSide = 2;
 constexpr std::size_t kMaxSizes = 4;
 
 struct FloatFit final : OneFit<FloatResizes> {
   FloatFit() : OneFit("resized", resize_floats) {}
   std::optional<CameraSize> camera_size() const override { return op.camera; }
+  std::vector<Resize>* float_sizes() override { return &op.sizes; }
 };
 
-Result<FloatResize> read_size(JsonFields& fields) {
-  FloatResize op;
-  VLA_TRY(op.width, fields.integer("width", kMinSide, kMaxImageSide));
-  VLA_TRY(op.height, fields.integer("height", kMinSide, kMaxImageSide));
-  VLA_TRY(const int filter, fields.choice("filter", {"bicubic", "area"}));
-  op.filter = static_cast<FloatResize::Filter>(filter);
+Result<Resize> read_size(JsonFields& fields) {
+  VLA_TRY(const Resize op, read_resize(fields, "resize_floats"));
   if (std::int64_t{op.width} * op.height > ImageLimits().max_pixels)
     return fields.wrong("height", fmt::format("at most {} pixels", ImageLimits().max_pixels));
   return op;
@@ -63,23 +58,23 @@ Result<FloatResize> read_size(JsonFields& fields) {
 
 /// Several in a row are one fit. The first may name the only frame size that is accepted.
 Status parse(JsonFields& fields, Recipe& recipe) {
-  auto* fit = dynamic_cast<FloatFit*>(recipe.fit.get());
-  if ((recipe.fit != nullptr && fit == nullptr) || !recipe.image.empty())
+  std::vector<Resize>* sizes = recipe.fit != nullptr ? recipe.fit->float_sizes() : nullptr;
+  if ((recipe.fit != nullptr && sizes == nullptr) || !recipe.image.empty())
     return misplaced(fields, "resize_floats as the first ops on images");
-  if (fit != nullptr && fit->op.sizes.size() == kMaxSizes) return misplaced(fields, "fewer sizes");
-  VLA_TRY(const FloatResize size, read_size(fields));
-  if (fit == nullptr) {
+  if (sizes != nullptr && sizes->size() == kMaxSizes) return misplaced(fields, "fewer sizes");
+  VLA_TRY(const Resize size, read_size(fields));
+  if (sizes == nullptr) {
     auto first = std::make_unique<FloatFit>();
-    fit = first.get();
-    recipe.fit = std::move(first);
     if (fields.has("from_width")) {
       CameraSize camera;
       VLA_TRY(camera.width, fields.integer("from_width", kMinSide, kMaxImageSide));
       VLA_TRY(camera.height, fields.integer("from_height", kMinSide, kMaxImageSide));
-      fit->op.camera = camera;
+      first->op.camera = camera;
     }
+    sizes = &first->op.sizes;
+    recipe.fit = std::move(first);
   }
-  fit->op.sizes.push_back(size);
+  sizes->push_back(size);
   recipe.width = size.width;
   recipe.height = size.height;
   return {};

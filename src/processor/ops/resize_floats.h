@@ -10,22 +10,14 @@
 #include "base/result.h"
 #include "processor/image.h"
 #include "processor/ops/op.h"
+#include "processor/ops/resize.h"
 
 namespace vla {
 
-/// One resize by `resample_torch_cubic` or `resample_torch_area`, without keeping the aspect.
-struct FloatResize {
-  enum class Filter { bicubic, area };
-
-  int width = 0;
-  int height = 0;
-  Filter filter = Filter::bicubic;
-};
-
-/// Resizes frames in floats to one size after the other; the last is the network's.
+/// Resizes frames in floats to one size after the other, by filters on floats; the last is the network's.
 struct FloatResizes {
   std::optional<CameraSize> camera;  // the only frame size accepted, if it determines the images' size
-  std::vector<FloatResize> sizes;
+  std::vector<Resize> sizes;
 };
 
 /// Writes (3, height, width) float32 to `out`; bytes are divided by 255 first. Bicubic edges may leave [0, 1]. A step

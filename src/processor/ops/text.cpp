@@ -122,6 +122,7 @@ struct ReplaceOp final : TextOp {
 /// Refuses an instruction that contains a text. It runs before ops that add text, so an empty instruction passes.
 struct RefuseOp final : TextOp {
   std::string text;
+  bool refuses() const override { return true; }
   Result<std::string> apply(std::string given, std::span<const int>) const override {
     if (given.find(text) == std::string::npos) return given;
     return Error{Code::bad_observation, "instruction", "text without " + text, "such a text",
@@ -163,8 +164,7 @@ Status read(JsonFields& fields, ReplaceOp& op, Recipe&) {
 }
 
 Status read(JsonFields& fields, RefuseOp& op, Recipe& recipe) {
-  const auto refuses = [](const auto& before) { return dynamic_cast<const RefuseOp*>(before.get()) != nullptr; };
-  if (!std::all_of(recipe.text.begin(), recipe.text.end(), refuses))
+  if (!std::all_of(recipe.text.begin(), recipe.text.end(), [](const auto& before) { return before->refuses(); }))
     return misplaced(fields, "refuse before other ops");
   VLA_TRY(op.text, read_text(fields, "text"));
   return op.text.empty() ? fields.wrong("text", "text to look for") : Status();
