@@ -31,7 +31,7 @@ Exit codes: 0 done, 1 internal, 2 usage, 3 bad_bundle, 4 bad_observation, 5 bad_
 8 device, 9 io, 10 mismatch, 11 bad_request (of vla replay, a damaged recording too); 12 and up are answers of a server
 (docs/protocol.md).)";
 
-/// Further lines of an error are indented; a line end in a text that it quotes is none.
+/// Prints an error. Its own further lines begin with two spaces; other line ends come from quoted text and are escaped.
 int fail(const vla::Error& error) {
   std::string message = error.message();
   for (std::size_t at = 0; (at = message.find('\n', at)) != std::string::npos; ++at)

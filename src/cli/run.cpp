@@ -69,7 +69,7 @@ Status add_image(Observation& observation, const std::string& argument, const Fe
 }
 
 Status add_state(Observation& observation, const std::string& argument, const Processor& processor) {
-  // Without a name the values are the only state feature that there is.
+  // Values without a name belong to the policy's only state feature.
   std::string name, numbers = argument;
   if (argument.find('=') != std::string::npos) {
     VLA_TRY(const NameValue state, split("--state", "NAME=v,v,...", argument));

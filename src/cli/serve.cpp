@@ -82,7 +82,7 @@ class Line {
     text_ += fmt::format(" {}={}", name, quoted(value));
     return *this;
   }
-  /// Nothing where there are no values.
+  /// Adds nothing if there are no values.
   Line& add(const char* name, const std::vector<std::string>& values, const char* between = ",") {
     return values.empty() ? *this : add(name, fmt::format("{}", fmt::join(values, between)));
   }
@@ -170,7 +170,7 @@ Error start_again() {
   return {Code::io, program, "a program that starts again", std::strerror(errno)};
 }
 
-/// As every policy of the server is loaded.
+/// Loads a policy with the server's options, from a file or a hub.
 Result<serve::LoadedPolicy> load_policy(const ServeOptions& options, std::string bundle) {
   if (std::string problem = find_pulled(bundle); !problem.empty()) return Error{Code::usage, bundle, "", problem};
   serve::LoadedPolicy policy;
@@ -383,7 +383,7 @@ Command add_serve(CLI::App& app) {
   command
       ->add_flag("--restart-on-device-loss", options->restarts,
                  "Start again when a GPU is lost; not given: end with exit code 8")
-      ->excludes("--trace", "--record");  // which the second start would find in its way
+      ->excludes("--trace", "--record");  // the second start would refuse the files of the first
   return [options] {
     bool ready = false;
     const Status status = serve(*options, ready);

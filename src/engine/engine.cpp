@@ -255,7 +255,7 @@ Status Engine::solve(Plan& plan, int n_step, std::vector<Tap>& taps) {
   return {};
 }
 
-/// Shows what was recorded to whoever wants to see it rather than to have it.
+/// Passes recorded values to the callback, if one is set, and drops them.
 void Engine::show(std::vector<Tap>& taps) const {
   if (!see_tap_) return;
   for (const Tap& tap : taps) see_tap_(tap.path, tap.shape, tap.values);

@@ -338,7 +338,7 @@ void Page::keep(const std::shared_ptr<Act>& act, std::span<const std::byte> in, 
     bytes_ += act->size;
     for (; bytes_ > kMaxBytes; acts_.pop_front()) bytes_ -= acts_.front()->size;
   }
-  if (act->size > kMaxBytes / 16) ::malloc_trim(0);  // many small ones went for it, whose memory it cannot have
+  if (act->size > kMaxBytes / 16) ::malloc_trim(0);  // returns the memory of the many small acts that it replaced
 }
 
 bool Page::may_ask(const std::string& query) const {

@@ -134,7 +134,8 @@ Error Recording::damaged(const std::string& expected, const std::string& found) 
 Result<Recording> Recording::open(const std::string& folder) {
   Recording recording(folder + "/" + kRecordingFile);
   std::error_code failed;
-  const bool is_file = std::filesystem::is_regular_file(recording.path_, failed);  // a pipe would be waited for
+  const bool is_file =
+      std::filesystem::is_regular_file(recording.path_, failed);  // opening a pipe would wait for its writer
   if (is_file) {
     recording.size_ = std::filesystem::file_size(recording.path_, failed);
     recording.file_.open(recording.path_, std::ios::binary);

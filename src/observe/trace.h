@@ -21,7 +21,7 @@ class Trace final : public Observer {
   ~Trace() override;
 
   void answered(const Answered& answered) override;
-  /// Requests that the disk was too slow for, or that came after the last byte.
+  /// Requests dropped because the disk was too slow or the file was full.
   std::uint64_t n_dropped() const { return writer_.n_dropped() + n_beyond_; }
 
  private:

@@ -14,11 +14,11 @@ namespace {
 
 const char* name_of(Rounding codes) { return codes == Rounding::int4 ? "int4" : "int8"; }
 
-/// A bundle that may be quantized, and what codes of it move.
+/// A bundle that may be quantized, and how far its codes move the actions.
 struct Candidate {
   std::string bundle;
   std::string int4 = {};  // its codes by Hessians, where they are better than plain ones
-  Moved moved = {};       // by the better ones
+  Moved moved = {};       // with the better codes
 };
 
 /// The steps of `calibrate` and their common state.

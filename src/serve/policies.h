@@ -37,8 +37,8 @@ class Policies {
 
   /// Without a name the default, or the only one. Errors: bad_observation, with the names that there are.
   Result<std::shared_ptr<ServedPolicy>> find(const std::string& name) const;
-  /// One of a name that is there takes the other's place, which is returned. Clients keep what they were told: errors:
-  /// incompatible where views, states, actions, rate or noise differ.
+  /// Adds a policy, or replaces the one of the same name and returns that. Errors: incompatible if the new one differs
+  /// in views, states, actions, rate or noise, which clients of the old one rely on.
   Result<std::shared_ptr<ServedPolicy>> put(std::shared_ptr<ServedPolicy> policy);
   /// Takes one out. Errors: bad_observation where there is none of that name; usage for the last one and the default.
   Result<std::shared_ptr<ServedPolicy>> remove(const std::string& name);

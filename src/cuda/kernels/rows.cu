@@ -83,7 +83,7 @@ VLA_DEVICE float sum_of_block(float x, int number) {
 template <int kGroups>
 VLA_DEVICE void store_codes(std::byte* y, int n, const float (&x)[kGroups][4]) {
   const int depth = (n + 63) / 64 * 64;
-  int most = 0;  // values behind the row's end are zeros, or NaN where a norm made it of a row with NaN
+  int most = 0;  // values after the row's end are 0, or NaN if the row has one
 #pragma unroll
   for (int j = 0; j < kGroups; ++j)
 #pragma unroll

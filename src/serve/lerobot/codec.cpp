@@ -63,7 +63,7 @@ const Names::Entry* view_of(const Names& names, std::string_view key) {
   return found == names.views.end() ? nullptr : &*found;
 }
 
-/// The name that a number has where its checkpoint names none.
+/// The name of a state's number i if the checkpoint gives none.
 std::string placeholder(const v1::StateSpec& state, std::size_t i) {
   return fmt::format("{}.{}", state.name().substr(state.name().rfind('.') + 1), i);
 }
