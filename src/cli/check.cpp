@@ -10,9 +10,9 @@
 #include "cli/say.h"
 #include "processor/image.h"
 #include "serve/first_frames.h"
-#include "serve/lerobot/codec.h"
 #include "serve/names.h"
 #include "serve/native/codec.h"
+#include "serve/server.h"
 
 namespace vla::cli {
 namespace {
@@ -31,17 +31,6 @@ std::string numbers_told(const google::protobuf::RepeatedPtrField<v1::Dimension>
         fmt::format("{} {}{}", i, name, numbers[i].unit().empty() ? "" : fmt::format(" [{}]", numbers[i].unit())));
   }
   return fmt::format("{}", fmt::join(told, ", "));
-}
-
-Result<serve::Names> names_of(const CheckOptions& options, const v1::Description& description) {
-  const serve::ServerOptions& server = options.server;
-  const bool is_gr00t = options.door == "gr00t";
-  serve::Given given = {server.preset, serve::lines_of(server.map, is_gr00t), server.absent};
-  if (options.door == "openpi") return serve::names_for(given, description, "--openpi");
-  if (is_gr00t) return serve::own_names(given, description, "--gr00t");
-  given.lines = server.map;
-  if (options.door == "lerobot") return serve::lerobot::lerobot_names(given, description);
-  return serve::native_names(given, description);
 }
 
 const v1::ViewSpec& view_of(const v1::Description& description, const std::string& name) {
@@ -120,7 +109,7 @@ Status check(const CheckOptions& options) {
       const std::unique_ptr<Engine> engine,
       Engine::load(options.bundle, {.dry = true, .absent = options.server.absent, .embodiment = options.embodiment}));
   const v1::Description description = serve::describe(*engine, {});
-  VLA_TRY(const serve::Names names, names_of(options, description));
+  VLA_TRY(const serve::Names names, serve::names_of(options.door, options.server, description));
   print_views(names, description);
   print_states(names, description);
   print_rest(names, description);
@@ -141,7 +130,7 @@ Command add_check(CLI::App& app) {
   command
       ->add_option("--door", options->door,
                    "The protocol: openpi, gr00t, lerobot, or native, that of vla's own clients")
-      ->check(CLI::IsMember({"openpi", "gr00t", "lerobot", "native"}))
+      ->check(CLI::IsMember(serve::protocols()))
       ->required();
   add_text(*command, "--preset", options->server.preset, "NAME", "As for vla serve: " + serve::presets());
   command->add_option("--map", options->server.map, "As for vla serve; several times")

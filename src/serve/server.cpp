@@ -40,32 +40,34 @@ Opened open_front(net::Loop& loop, const ServerOptions& options) {
   return front;
 }
 
-const DoorFront::Door kLeRobot{"vla-door-lerobot",
-                               "--lerobot",
-                               "lerobot",
-                               "grpc://",
-                               &ServerOptions::lerobot,
-                               [](const ServerOptions& options, const ServedPolicy& policy) -> Result<std::string> {
-                                 VLA_CHECK(check_one_robot(*policy.engine, "--lerobot"));
-                                 const Given given = {{}, options.map, options.absent};
-                                 VLA_TRY(const Names names, lerobot::lerobot_names(given, policy.description));
-                                 return names.told();
-                               }};
+Result<Names> native_names_of(const ServerOptions& options, const v1::Description& description) {
+  return native_names({options.preset, options.map, options.absent}, description);
+}
+
+Result<Names> lerobot_names_of(const ServerOptions& options, const v1::Description& description) {
+  return lerobot::lerobot_names({{}, options.map, options.absent}, description);
+}
+
+const DoorFront::Door kLeRobot{"vla-door-lerobot",      "--lerobot",     "lerobot", "grpc://",
+                               &ServerOptions::lerobot, lerobot_names_of};
 
 /// A protocol and its front end.
 struct Protocol {
+  const char* name;
   std::string ServerOptions::*address;  // it is served where this is not empty; null: always
   std::size_t n_descriptor;             // of this process for a connection
   Opened (*open)(net::Loop& loop, const ServerOptions& options);
+  Result<Names> (*names_of)(const ServerOptions& options, const v1::Description& description);
 
   bool is_wanted(const ServerOptions& options) const { return address == nullptr || !(options.*address).empty(); }
 };
 const Protocol kProtocols[] = {
-    {nullptr, 1, open_front<NativeFront>},
-    {&ServerOptions::openpi, 1, open_front<openpi::Front>},
-    {&ServerOptions::gr00t, 1, open_front<gr00t::Front>},
-    {&ServerOptions::lerobot, 0,
-     [](net::Loop& loop, const ServerOptions& options) { return DoorFront::open(loop, options, kLeRobot); }},
+    {"native", nullptr, 1, open_front<NativeFront>, native_names_of},
+    {"openpi", &ServerOptions::openpi, 1, open_front<openpi::Front>, openpi::Front::names_of},
+    {"gr00t", &ServerOptions::gr00t, 1, open_front<gr00t::Front>, gr00t::Front::names_of},
+    {"lerobot", &ServerOptions::lerobot, 0,
+     [](net::Loop& loop, const ServerOptions& options) { return DoorFront::open(loop, options, kLeRobot); },
+     lerobot_names_of},
 };
 
 /// The options with as few connections as there are descriptors for: what watches a server has to reach one that has
@@ -95,6 +97,19 @@ v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
 }
 
 }  // namespace
+
+std::vector<std::string> protocols() {
+  std::vector<std::string> names;
+  for (const Protocol& protocol : kProtocols) names.emplace_back(protocol.name);
+  return names;
+}
+
+Result<Names> names_of(const std::string& protocol, const ServerOptions& options, const v1::Description& description) {
+  const auto is_it = [&](const Protocol& each) { return protocol == each.name; };
+  const auto found = std::find_if(std::begin(kProtocols), std::end(kProtocols), is_it);
+  if (found == std::end(kProtocols)) return Error{Code::usage, "protocol", "a protocol of this server", protocol};
+  return found->names_of(options, description);
+}
 
 Exchange::Jobs::Limits Server::limits_of(const ServerOptions& options) {
   return {options.max_queue, kQueueMessages * options.max_message};

@@ -93,8 +93,9 @@ Status DoorFront::await_ready() {
 }
 
 Status DoorFront::serve(const ServedPolicy& policy) {
-  VLA_TRY(told_, door_.check(options_, policy));
-  told_ = fmt::format("{}={}", door_.name, told_);
+  VLA_CHECK(check_one_robot(*policy.engine, door_.option));
+  VLA_TRY(const Names names, door_.names_of(options_, policy.description));
+  told_ = fmt::format("{}={}", door_.name, names.told());
   description_ = policy.description.SerializeAsString();
   return {};
 }

@@ -11,6 +11,7 @@
 #include "serve/door/link.h"
 #include "serve/door/process.h"
 #include "serve/front.h"
+#include "serve/names.h"
 #include "serve/options.h"
 
 namespace vla::serve {
@@ -23,9 +24,8 @@ class DoorFront final : public Front, Link::Handler {
   struct Door {
     const char *program, *option, *name, *scheme;  // vla-door-x, --x, x, x://
     std::string ServerOptions::*address;
-    /// Returns the names that its clients use, for display. Errors: usage if the protocol cannot carry what a policy
-    /// takes.
-    Result<std::string> (*check)(const ServerOptions& options, const ServedPolicy& policy);
+    /// The names that its clients use. Errors: usage if the protocol cannot carry what a policy takes.
+    Result<Names> (*names_of)(const ServerOptions& options, const v1::Description& description);
   };
   /// Binds the address and starts the process. Errors: usage, io, unsupported.
   static Result<std::unique_ptr<Front>> open(net::Loop& loop, const ServerOptions& options, const Door& door);

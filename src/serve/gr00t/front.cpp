@@ -95,9 +95,13 @@ Front::Front(net::Loop& loop, const ServerOptions& options, std::string api_toke
       api_token_(std::move(api_token)),
       hub_(loop, {options.max_message, options.max_connections, kReceiptMessages * options.max_message}, nullptr) {}
 
+Result<Names> Front::names_of(const ServerOptions& options, const v1::Description& description) {
+  return own_names({{}, lines_of(options.map, true), options.absent}, description, "--gr00t");
+}
+
 Status Front::serve(const ServedPolicy& policy) {
   VLA_CHECK(check_one_robot(*policy.engine, "--gr00t"));
-  VLA_TRY(names_, own_names({{}, lines_of(options_.map, true), options_.absent}, policy.description, "--gr00t"));
+  VLA_TRY(names_, names_of(options_, policy.description));
   replaced(policy.description);
   if (options_.gr00t_n1_5) last_ = {msgpack::Framing::npy, true, true, false};
   return {};

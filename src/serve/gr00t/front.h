@@ -15,6 +15,8 @@ class Front final : public serve::Front, zmtp::Hub::Handler {
   /// Binds `options.gr00t`. Errors: usage, io.
   static Result<std::unique_ptr<Front>> open(net::Loop& loop, const ServerOptions& options);
 
+  static Result<Names> names_of(const ServerOptions& options, const v1::Description& description);
+
   std::vector<std::string> addresses() const override { return {"gr00t+" + address_}; }
   Status serve(const ServedPolicy& policy) override;
   void replaced(const v1::Description& description) override { description_ = description; }

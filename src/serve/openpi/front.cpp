@@ -70,10 +70,13 @@ Front::Front(net::Loop& loop, const ServerOptions& options, std::string api_key)
       sockets_(loop, {options.max_message, options.max_connections, kReceiptMessages * options.max_message},
                std::move(api_key)) {}
 
+Result<Names> Front::names_of(const ServerOptions& options, const v1::Description& description) {
+  return names_for({options.preset, lines_of(options.map, false), options.absent}, description, "--openpi");
+}
+
 Status Front::serve(const ServedPolicy& policy) {
   VLA_CHECK(check_one_robot(*policy.engine, "--openpi"));
-  const Given given = {options_.preset, lines_of(options_.map, false), options_.absent};
-  VLA_TRY(names_, names_for(given, policy.description, "--openpi"));
+  VLA_TRY(names_, names_of(options_, policy.description));
   replaced(policy.description);
   return {};
 }
