@@ -92,9 +92,8 @@ void SmoothingPlaces::see(const Graph& graph) {
 std::vector<SmoothingPlace> SmoothingPlaces::found() const {
   std::vector<SmoothingPlace> found;
   for (const auto& [weight, place] : places_) {
-    const auto is_only = [&](const Uses& uses, const Param* param) {
-      return uses.at(param) == std::set<const Param*>{place.weight};
-    };
+    const std::set<const Param*> itself = {place.weight};
+    const auto is_only = [&](const Uses& uses, const Param* param) { return uses.at(param) == itself; };
     const bool reads_well = std::ranges::all_of(
         place.readers, [&](const Param* matrix) { return has_exponents(*matrix) && is_only(columns_, matrix); });
     const bool divides_well = is_only(rows_, weight) && (place.bias == nullptr || is_only(rows_, place.bias)) &&
