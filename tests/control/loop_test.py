@@ -12,7 +12,7 @@ import pytest
 
 import vla_cpp
 from vla_cpp import BundleInfo, Chunk, Spec, UsageError
-from vla_cpp.control import ChunkLoop, CrossFade, RealTimeChunking
+from vla_cpp.control import ChunkLoop, Column, CrossFade, Limits, RealTimeChunking
 
 HORIZON = 10
 SPEC = Spec(
@@ -380,3 +380,27 @@ def test_rtc_is_refused_without_its_settings_and_without_a_policy_that_does_it(c
         loop_of(Continuing(clock), clock, mode="rtc", rtc=RealTimeChunking(11))
     with pytest.raises(vla_cpp.Unsupported, match="mode"):
         loop_of(Remote(clock), clock, mode="rtc", rtc=settings)
+
+
+def test_a_loop_with_limits_starts_where_the_robot_is_and_keeps_them(clock):
+    limits = Limits((Column("x", "position", "", -1, 3, velocity=5),), 0.9)  # rows of a chunk are 1 apart, at 10 Hz
+    with loop_of(Remote(clock), clock, mode="sync", limits=limits) as loop:
+        with pytest.raises(UsageError, match="start_at of the loop"):
+            loop.step({"state": 0.0})
+        loop.reset()
+        with pytest.raises(UsageError, match="found 4, where the robot is"):
+            loop.start_at([4.0])
+        loop.start_at([0.0])
+        values = []
+        for _ in range(4):
+            values.append(float(loop.step({"state": 0.0}).values[0]))
+            loop.pace()
+        assert values == [0.0, 0.5, 1.0, 1.5]
+        assert loop.stats["limited"] == 3 and loop.stats["refused"] == 0
+    with loop_of(Remote(clock), clock, mode="sync", limits=dataclasses.replace(limits, refuse_above=0.5)) as loop:
+        loop.start_at([0.0])
+        with pytest.raises(vla_cpp.BadAction, match="found 9 of 10, the first of them row 1"):
+            loop.step({"state": 0.0})
+        assert loop.stats["refused"] == 1
+    with pytest.raises(UsageError, match="a loop with limits"):
+        loop_of(Remote(clock), clock).start_at([0.0])

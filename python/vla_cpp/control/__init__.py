@@ -3,7 +3,8 @@
 """Running action chunks on a robot: when to ask, which row to command, what to do when the answer is late (docs/control.md)."""
 
 from .blend import Blend, CrossFade, Ensemble
+from .limits import Column, Limiter, Limits
 from .loop import ChunkLoop, RealTimeChunking
 from .schedule import Action, ChunkSchedule
 
-__all__ = ["Action", "Blend", "ChunkLoop", "ChunkSchedule", "CrossFade", "Ensemble", "RealTimeChunking"]
+__all__ = ["Action", "Blend", "ChunkLoop", "ChunkSchedule", "Column", "CrossFade", "Ensemble", "Limiter", "Limits", "RealTimeChunking"]

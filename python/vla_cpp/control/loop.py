@@ -10,6 +10,7 @@ import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Union
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from ..errors import Busy, Disconnected, Late, Noted, ShuttingDown, Superseded, Timeout, Unsupported, UsageError, VlaError
 from ..observation import Leftover, is_pillow
 from .blend import Blend, CrossFade, Ensemble
+from .limits import Limiter, Limits
 from .schedule import Action, ChunkSchedule, OnLate, late_rule
 
 Observation = Union[Mapping[str, Any], Callable[[], Mapping[str, Any]]]
@@ -69,6 +71,8 @@ class ChunkLoop:
                   them, "warn" of each (Python's warnings), or "raise" Noted instead of commanding the chunk. `stats` counts them
     max_age       seconds between an observation and the last command that may come of it. By default the time that the rows of a
                   chunk take in "async" mode; in "sync" mode, where the robot stands still meanwhile, any
+    limits        Limits, or the file of some (docs/control.md): no command breaks them, and `start_at` says first where the robot is.
+                  A chunk that breaks them in too many rows is BadAction. None: the robot's own controller has to refuse
     max_jump      largest change of each value from one command to the next, beyond which it is cut: a number, or one per value
     clock, sleep  seconds, and waiting for so many: time.monotonic and time.sleep
 
@@ -92,6 +96,7 @@ class ChunkLoop:
         rtc: Optional[RealTimeChunking] = None,
         max_age: Optional[float] = None,
         max_jump: Union[float, np.ndarray, None] = None,
+        limits: Union[Limits, str, Path, None] = None,
         allow_other_rate: bool = False,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
@@ -114,6 +119,9 @@ class ChunkLoop:
             raise Unsupported("mode", "a policy that goes on from rows of the chunk before", spec.bundle.name)
         if rtc and not 1 <= rtc.overlap <= spec.horizon:
             raise UsageError("rtc.overlap", f"1 to {spec.horizon}, the rows of a chunk", str(rtc.overlap))
+        if isinstance(limits, (str, Path)):
+            limits = Limits.read(limits)
+        self._limiter = Limiter(limits.of(spec), rate_hz) if limits else None
         self.schedule = ChunkSchedule(
             horizon=spec.horizon,
             d_action=spec.d_action,
@@ -122,6 +130,7 @@ class ChunkLoop:
             on_late=late_rule(on_late, spec.d_action),
             max_age=_age_in_ticks(max_age, rate_hz, None if mode == "sync" else spec.horizon),
             max_jump=max_jump,
+            limiter=self._limiter,
         )
         self.rate_hz, self.mode, self.rtc, self.on_note = rate_hz, mode, rtc, on_note
         self._policy, self._clock, self._sleep = policy, clock, sleep
@@ -136,6 +145,15 @@ class ChunkLoop:
         self._missed = self._notes = 0
         self._errors: Dict[str, int] = {}
         self.last_error: Optional[VlaError] = None
+
+    def start_at(self, values: Any) -> None:
+        """Where the robot rests now, one number for each action: `limits` are kept from there. Again after `reset`.
+
+        Errors: UsageError without limits, or for a position outside of them.
+        """
+        if not self._limiter:
+            raise UsageError("start_at", "a loop with limits", "none")
+        self._limiter.rest_at(values)
 
     def step(self, observation: Observation) -> Action:
         """One control period.
@@ -174,7 +192,7 @@ class ChunkLoop:
     @property
     def stats(self) -> Dict[str, Any]:
         """Counts since the start: actions, held, chunks, stale (dropped for their age), failed (in all, and by the error's code),
-        limited, missed (periods without a call of `step`), notes; and the delay in steps."""
+        limited, refused, missed (periods without a call of `step`), notes; and the delay in steps."""
         own = {"missed": self._missed, "notes": self._notes, "delay": self.schedule.delay}
         return {**self.schedule.counts, **self._errors, **own}
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..errors import BadAction, Late, UsageError
 from .blend import Blend, Source
+from .limits import Limiter
 
 OnLate = Callable[[Optional[np.ndarray], int], Optional[np.ndarray]]
 N_DELAY = 16  # inferences that an estimate of the delay looks back on
@@ -32,7 +33,8 @@ class Action:
     age      control periods since the oldest observation that contributes; None where held
     sources  (tick of the observation, weight) of what contributes; the tick is None for the held command in a fade
     chunk    the newest contributing chunk, as it was received; None where held
-    limited  `max_jump` cut it
+    limited  `max_jump` or a limit cut it
+    clamped  the columns that a limit cut
     """
 
     values: Optional[np.ndarray]
@@ -42,6 +44,7 @@ class Action:
     sources: Tuple[Tuple[Optional[int], float], ...] = ()
     chunk: Any = None
     limited: bool = False
+    clamped: Tuple[int, ...] = ()
 
 
 class Flight(NamedTuple):
@@ -62,6 +65,7 @@ class ChunkSchedule:
     max_age            control periods after its observation in which a row may be commanded; None: as long as there are rows
     max_jump           largest change of each value from one command to the next: a number, or (d_action,); None: any.
                        What `on_late` says is not limited: a stop must be able to be sudden
+    limiter            keeps every command within limits, those of `on_late` too: then a stop is as fast as they permit
     """
 
     def __init__(
@@ -74,7 +78,10 @@ class ChunkSchedule:
         on_late: OnLate,
         max_age: Optional[int] = None,
         max_jump: Union[float, np.ndarray, None] = None,
+        limiter: Optional[Limiter] = None,
     ) -> None:
+        if limiter is not None and max_jump is not None:
+            raise UsageError("max_jump", "none beside limits, which say how far a command may jump", str(max_jump))
         if not 1 <= replan_every <= horizon:
             raise UsageError("replan_every", f"1 to {horizon}, the rows of a chunk", str(replan_every))
         if max_age is not None and max_age < 0:
@@ -82,12 +89,16 @@ class ChunkSchedule:
         self.horizon, self.d_action, self.replan_every = horizon, d_action, replan_every
         self._blend, self._on_late, self._max_age = blend, on_late, max_age
         self._max_jump = _limits(max_jump, d_action)
+        self._limiter = limiter
         self.reset()
 
     def reset(self) -> None:
         """Forgets everything, as before the first call: an episode begins."""
         self.step = 0
-        self.counts: Dict[str, int] = dict.fromkeys(("actions", "held", "chunks", "stale", "failed", "limited"), 0)
+        counts = ("actions", "held", "chunks", "stale", "failed", "limited", "refused")
+        self.counts: Dict[str, int] = dict.fromkeys(counts, 0)
+        if self._limiter:
+            self._limiter.reset()
         self._sources: List[Source] = []
         self._flight: Optional[Flight] = None
         self._last: Optional[np.ndarray] = None  # the last command
@@ -131,7 +142,8 @@ class ChunkSchedule:
     def receive(self, chunk: Any, tick: int) -> bool:
         """The chunk for the observation under way. False: it came too late to be of use, and was dropped.
 
-        Errors: BadAction for a chunk of another shape, or with a number that is not finite; nothing of it is used.
+        Errors: BadAction for a chunk of another shape, or with a number that is not finite, or too many of whose rows break a limit;
+        nothing of it is used.
         """
         self._begin(tick)
         flight, self._flight = self._flight, None
@@ -141,6 +153,8 @@ class ChunkSchedule:
         if rows.shape != (self.horizon, self.d_action) or not np.isfinite(rows).all():
             found = f"shape {rows.shape}" if rows.shape != (self.horizon, self.d_action) else "one that is not"
             raise BadAction("chunk", f"({self.horizon}, {self.d_action}) finite numbers", found)
+        if self._limiter:
+            self._check_limits(rows)
         if flight.is_warm:
             self._delays.append(self.step - flight.step)
         self.counts["chunks"] += 1
@@ -169,14 +183,14 @@ class ChunkSchedule:
         weights = self._blend.weights(self._sources, self.step)
         parts = [(w, s) for w, s in zip(weights, self._sources) if w > 0]
         values = sum(w * s.row(self.step).astype(np.float64) for w, s in parts).astype(np.float32)
-        values, limited = self._limit(values)
+        values, limited, clamped = self._limit(values)
         self._last = values
         self.step += 1
         self.counts["actions"] += 1
         self.counts["limited"] += limited
         ages = [tick - s.tick for _, s in parts if s.tick is not None]
         sources = tuple((s.tick, float(w)) for w, s in parts)
-        return Action(values.copy(), tick, False, max(ages), sources, parts[-1][1].chunk, limited)
+        return Action(values.copy(), tick, False, max(ages), sources, parts[-1][1].chunk, limited, clamped)
 
     # --- inside ----------------------------------------------------------------------------------------------------------------
 
@@ -212,15 +226,30 @@ class ChunkSchedule:
             values = np.array(values, np.float32)
             if values.shape != (self.d_action,) or not np.isfinite(values).all():
                 raise BadAction("on_late", f"{self.d_action} finite numbers", str(values))
+            clamped: Tuple[int, ...] = ()
+            if self._limiter:
+                values, _, clamped = self._limit(values)
             self._last = values
-            values = values.copy()
-        return Action(values, tick, True)
+            return Action(values.copy(), tick, True, limited=bool(clamped), clamped=clamped)
+        return Action(None, tick, True)
 
-    def _limit(self, values: np.ndarray) -> Tuple[np.ndarray, bool]:
+    def _limit(self, values: np.ndarray) -> Tuple[np.ndarray, bool, Tuple[int, ...]]:
+        if self._limiter:
+            values, is_cut = self._limiter.step(values)
+            return values, bool(is_cut.any()), tuple(int(i) for i in np.flatnonzero(is_cut))
         if self._max_jump is None or self._last is None:
-            return values, False
+            return values, False, ()
         cut = np.clip(values, self._last - self._max_jump, self._last + self._max_jump)
-        return cut, bool((cut != values).any())
+        return cut, bool((cut != values).any()), ()
+
+    def _check_limits(self, rows: np.ndarray) -> None:
+        broken = self._limiter.breaks(rows)
+        most = self._limiter.limits.refuse_above
+        if broken.mean() > most:
+            self.counts["refused"] += 1
+            found = f"{int(broken.sum())} of {len(rows)}, the first of them row {int(np.argmax(broken))}"
+            hint = "statistics, units or the order of columns may be another robot's"
+            raise BadAction("chunk", f"at most a share of {most:g} of its rows outside of the limits", found, hint)
 
 
 def late_rule(on_late: Union[str, OnLate], d_action: int) -> OnLate:

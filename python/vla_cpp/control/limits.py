@@ -1,0 +1,390 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a command may be: ranges, velocities, accelerations and jerks of each action column, as data.
+
+A `Limiter` changes as little as it can of a command that breaks a limit, and nothing of one that keeps all of them. It keeps this
+invariant: **from the last command there is a stop within all limits**, a list of accelerations after which the column rests.
+
+* Before the first command the column rests, and the stop is empty.
+* A command is taken as it is if it keeps the limits and a stop from it is found (`_stops`).
+* Else one between it and the next command of the kept stop is taken, as near to the wanted one as a search by halves finds with a
+  stop of its own; in the worst case the next command of the kept stop itself, whose rest is the stop from there.
+
+So every command keeps every limit, by induction; and since a later command starts from a state with a stop, cutting one never leaves
+the next ones without a permitted value. Commands stay in their order: each is made from its own row and from the ones before alone.
+Numbers are double; a command is rounded to float32 once, so that a difference of two may be off by that rounding.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
+
+import numpy as np
+
+from ..errors import BadAction, UsageError
+from ..spec import Spec
+
+FORMAT = "vla-limits 1"
+KINDS = ("position", "velocity", "difference")
+N_HALF = 16  # halvings of the search for a permitted command
+MAX_STOP = 4096  # steps of the longest stop that is looked for
+FAR = 1e9  # in place of a limit that is not given
+SLACK = 1e-9  # of rounding in double, relative to the limit
+
+
+@dataclass(frozen=True)
+class Column:
+    """The limits of an action column, in its unit and seconds. None: not limited.
+
+    kind          "position": the value is a place. "velocity": units per second. "difference": units per control period
+    unit          as the bundle says it; empty where it does not
+    low, high     of the value itself
+    velocity      largest change of place a second: of a position between commands, of the others the value itself
+    acceleration  largest change of the velocity a second
+    jerk          largest change of the acceleration a second
+    """
+
+    name: str
+    kind: str
+    unit: str = ""
+    low: Optional[float] = None
+    high: Optional[float] = None
+    velocity: Optional[float] = None
+    acceleration: Optional[float] = None
+    jerk: Optional[float] = None
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of all columns of an action, and the share of a chunk's rows that may break them before the chunk is refused.
+
+    Errors: UsageError, naming the column, for what is missing, unknown, not a number, or impossible together.
+    """
+
+    columns: Tuple[Column, ...]
+    refuse_above: float
+
+    def __post_init__(self) -> None:
+        for column in self.columns:
+            _check(column)
+        if len({c.name for c in self.columns}) < len(self.columns):
+            raise UsageError("limits", "each column once", "one twice")
+        if not 0 <= self.refuse_above <= 1:
+            raise UsageError("limits.refuse_above", "a share of rows, 0 to 1", str(self.refuse_above))
+
+    @staticmethod
+    def read(path: Union[str, Path]) -> Limits:
+        """A file that `write` wrote or a person: docs/control.md."""
+        try:
+            text = Path(path).read_text("utf-8")
+            return Limits.parse(json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_each_once))
+        except (OSError, ValueError, RecursionError) as error:
+            raise UsageError(str(path), "a file of limits in JSON", str(error)) from None
+
+    @staticmethod
+    def parse(document: Any) -> Limits:
+        fields = {"format", "columns", "refuse_above"}
+        if not isinstance(document, dict) or set(document) != fields or document["format"] != FORMAT:
+            raise UsageError("limits", f'an object with {", ".join(sorted(fields))}, of format "{FORMAT}"', str(document)[:80])
+        if not isinstance(document["columns"], dict) or not document["columns"]:
+            raise UsageError("limits.columns", "an object with each action's name", str(document["columns"])[:80])
+        columns = tuple(_parse_column(name, given) for name, given in document["columns"].items())
+        return Limits(columns, _number("limits.refuse_above", document["refuse_above"]))
+
+    def write(self, path: Union[str, Path]) -> None:
+        columns = {c.name: _document(c) for c in self.columns}
+        document = {"format": FORMAT, "columns": columns, "refuse_above": self.refuse_above}
+        Path(path).write_text(json.dumps(document, indent=2) + "\n", "utf-8")
+
+    @staticmethod
+    def suggest(
+        spec: Spec, kinds: Mapping[str, str], commands: np.ndarray, rate_hz: float, *, margin: float, refuse_above: float
+    ) -> Limits:
+        """First limits from what a robot really was commanded: the largest of each, times `margin`.
+
+        kinds     "position", "velocity" or "difference" of each action
+        commands  (n, d_action), n of at least four, one after the other at `rate_hz`
+        margin    1 or more; a range grows by its share of the range
+        """
+        rows = np.asarray(commands, np.float64)
+        if rows.ndim != 2 or rows.shape[1] != spec.d_action or len(rows) < 4 or not np.isfinite(rows).all():
+            raise UsageError("commands", f"(4 or more, {spec.d_action}) finite numbers", f"shape {rows.shape}")
+        if not 1 <= margin < math.inf or not 0 < rate_hz < math.inf:
+            raise UsageError("margin, rate_hz", "1 or more, and above 0", f"{margin}, {rate_hz}")
+        _check_names(kinds, spec)
+        columns = []
+        for i, name in enumerate(spec.action_names):
+            low, high = rows[:, i].min(), rows[:, i].max()
+            grown = (margin - 1) / 2 * (high - low)
+            scale = _scale(kinds[name], rate_hz)
+            place = rows[:, i] if kinds[name] == "position" else np.cumsum(rows[:, i])
+            most = [margin * float(np.abs(np.diff(place, n)).max()) / s or None for n, s in zip((1, 2, 3), scale)]
+            unit = spec.action_units[i] if spec.action_units else ""
+            columns.append(Column(name, kinds[name], unit, float(low - grown), float(high + grown), *most))
+        return Limits(tuple(columns), refuse_above)
+
+    def of(self, spec: Spec) -> Limits:
+        """The same in the order of the policy's columns. Errors: UsageError where names or units differ from the bundle's."""
+        given = {c.name: c for c in self.columns}
+        _check_names(given, spec)
+        for name, unit in zip(spec.action_names, spec.action_units or [""] * spec.d_action):
+            if unit and given[name].unit != unit:
+                raise UsageError(f"limits.{name}.unit", f'"{unit}", as {spec.bundle.name} says', f'"{given[name].unit}"')
+        return Limits(tuple(given[name] for name in spec.action_names), self.refuse_above)
+
+
+class Stops(NamedTuple):
+    """A way to rest for each column: accelerations [steps, columns], zeros after a column's own; `found`: where there is one."""
+
+    found: np.ndarray
+    steps: np.ndarray
+
+
+class Limiter:
+    """Keeps the commands of one robot within limits. One `step` for each control period, in order.
+
+    limits   in the order of the columns (`Limits.of`)
+    rate_hz  commands per second
+    """
+
+    def __init__(self, limits: Limits, rate_hz: float) -> None:
+        self.limits = limits
+        columns = limits.columns
+        self._is_place = np.array([c.kind == "position" for c in columns])
+        low, high = (np.array([_or(getattr(c, f), s * FAR) for c in columns]) for f, s in (("low", -1), ("high", 1)))
+        scale = np.array([_scale(c.kind, rate_hz) for c in columns]).T
+        most = [np.array([_or(getattr(c, f), math.inf) for c in columns]) * s for f, s in zip(("velocity", "acceleration", "jerk"), scale)]
+        # Where a limit is missing, one that the others imply: none of these is ever reached.
+        self._low, self._high = np.where(self._is_place, low, -np.inf), np.where(self._is_place, high, np.inf)
+        step = np.minimum(most[0], np.where(self._is_place, np.maximum(high - low, 0), FAR))
+        self._slowest = np.where(self._is_place, -step, np.maximum(low, -step))
+        self._fastest = np.where(self._is_place, step, np.minimum(high, step))
+        self._acceleration = np.minimum(most[1], 2 * (self._fastest - self._slowest) + SLACK)
+        self._jerk = np.minimum(most[2], 2 * self._acceleration)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the commands: where a position is has to be said again by `rest_at`."""
+        n = len(self._is_place)
+        self._place = np.where(self._is_place, np.nan, 0.0)
+        self._velocity, self._change = np.zeros(n), np.zeros(n)
+        self._stop = np.zeros((0, n))
+
+    def rest_at(self, values: Any) -> None:
+        """The robot rests at these values; of velocities and differences zero is meant, whatever is given.
+
+        Errors: UsageError for a position outside of its limits, from which no command would be permitted.
+        """
+        values = self._read("rest_at", values)
+        outside = self._is_place & ((values < self._low) | (values > self._high))
+        if outside.any():
+            i = int(np.argmax(outside))
+            column = self.limits.columns[i]
+            raise UsageError(f"limits.{column.name}", f"{column.low} to {column.high}", f"{values[i]:g}, where the robot is")
+        self.reset()
+        self._place = np.where(self._is_place, values, 0.0)
+
+    def step(self, values: Any) -> Tuple[np.ndarray, np.ndarray]:
+        """The command for wanted values, float32, and which of its columns differ from them.
+
+        Errors: UsageError before `rest_at` where there is a position; BadAction for a value that is not finite.
+        """
+        wanted = self._read("command", values)
+        if np.isnan(self._place).any():
+            raise UsageError("limits", "where the robot is: rest_at, or start_at of the loop", "nothing")
+        change = np.where(self._is_place, wanted - self._place, wanted) - self._velocity
+        low, high = self._span()
+        kept = self._stop[0] if len(self._stop) else np.zeros_like(change)
+        inside = (change >= low - SLACK * (1 + np.abs(low))) & (change <= high + SLACK * (1 + np.abs(high)))
+        best, stops = self._nearest(kept, np.where(inside, change, np.clip(change, np.minimum(low, kept), np.maximum(high, kept))))
+        self._change = best
+        self._velocity = self._velocity + best
+        out = np.where(self._is_place, self._place + self._velocity, self._velocity)
+        is_cut = out.astype(np.float32) != wanted.astype(np.float32)
+        out = np.where(is_cut, out, wanted)
+        self._place = np.where(self._is_place, out, 0.0)
+        self._stop = stops
+        return out.astype(np.float32), is_cut
+
+    def breaks(self, rows: np.ndarray) -> np.ndarray:
+        """Which rows of a chunk break a limit by themselves or together with the rows before them: bool, one a row."""
+        rows = np.asarray(rows, np.float64)
+        slack = 8 * np.finfo(np.float32).eps * np.abs(rows).max(0, initial=0)  # rows are float32, and differences of them
+        velocity = np.where(self._is_place, np.diff(rows, axis=0, prepend=rows[:1]), rows)
+        broken = self._is_place & ((rows < self._low - slack) | (rows > self._high + slack))
+        broken |= (velocity < self._slowest - slack) | (velocity > self._fastest + slack)
+        index = np.arange(len(rows))[:, None]
+        first = np.where(self._is_place, 2, 1)  # row that has an acceleration: two velocities before it are known
+        for n, most in enumerate((self._acceleration, self._jerk)):
+            change = np.diff(velocity, n + 1, axis=0, prepend=np.zeros((n + 1, rows.shape[1])))
+            broken |= (index >= first + n) & (np.abs(change) > most + 2 ** (n + 1) * slack)
+        return broken.any(1)
+
+    # --- inside ----------------------------------------------------------------------------------------------------------------
+
+    def _read(self, where: str, values: Any) -> np.ndarray:
+        values = np.array(values, np.float64)
+        if values.shape != self._is_place.shape or not np.isfinite(values).all():
+            raise BadAction(where, f"{len(self._is_place)} finite numbers", str(values))
+        return values
+
+    def _span(self) -> Tuple[np.ndarray, np.ndarray]:
+        """The least and the largest acceleration that keep every limit in this step."""
+        ahead = self._place + self._velocity
+        low = np.maximum.reduce([-self._acceleration, self._change - self._jerk, self._slowest - self._velocity, self._low - ahead])
+        high = np.minimum.reduce([self._acceleration, self._change + self._jerk, self._fastest - self._velocity, self._high - ahead])
+        return low, high
+
+    def _nearest(self, kept: np.ndarray, wanted: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+        """The acceleration of each column that is nearest to the wanted one and has a stop, and these stops."""
+        stops = self._stops(wanted)
+        if stops.found.all():
+            return wanted, stops.steps
+        n = max(len(stops.steps), len(self._stop))
+        best = np.where(stops.found, wanted, kept)
+        plan = np.where(stops.found, _padded(stops.steps, n), _padded(self._stop[1:], n))
+        near, far = np.where(stops.found, 1.0, 0.0), np.ones(len(wanted))  # shares of the way from kept to wanted
+        for _ in range(N_HALF):
+            share = (near + far) / 2
+            tried = kept + share * (wanted - kept)
+            stops = self._stops(tried)
+            better = stops.found & (near < far)
+            n = max(n, len(stops.steps))
+            best, plan = np.where(better, tried, best), np.where(better, _padded(stops.steps, n), _padded(plan, n))
+            near, far = np.where(better, share, near), np.where(better, far, share)
+        return best, plan
+
+    def _stops(self, change: np.ndarray) -> Stops:
+        """The shortest stop of each column after a step with this acceleration.
+
+        A stop of n steps has accelerations between the bounds that the limits give them, forwards from this one and backwards from
+        rest, and a sum that takes the velocity away. Its bounds are convex, so a share between all lower and all upper ones keeps
+        them; a stop of n steps is one of n + 1 too, so the least n is found by halves.
+        """
+        velocity = self._velocity + change
+        place = np.where(self._is_place, self._place + velocity, 0.0)
+        n = self._least_steps(velocity, change)
+        low, high = self._bounds(change, n)
+        room = (high - low).sum(0)
+        share = np.clip(np.divide(-velocity - low.sum(0), room, out=np.zeros_like(room), where=room > 0), 0, 1)
+        steps = low + share * (high - low)
+        speeds = velocity + np.cumsum(steps, 0)
+        places = place + np.cumsum(speeds, 0)
+        slack = SLACK * (1 + np.abs(self._fastest))
+        found = (n >= 0) & (velocity >= self._slowest - slack) & (velocity <= self._fastest + slack)
+        found &= ((speeds >= self._slowest - slack) & (speeds <= self._fastest + slack)).all(0)
+        edge = SLACK * (1 + np.where(self._is_place, np.abs(place), 0.0))
+        within = (places >= self._low - edge) & (places <= self._high + edge)
+        found &= ~self._is_place | (within.all(0) & (place >= self._low - edge) & (place <= self._high + edge))
+        return Stops(found, steps)
+
+    def _least_steps(self, velocity: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """The least number of steps in which each column can rest; -1 where it is beyond MAX_STOP."""
+
+        def enough(n: np.ndarray) -> np.ndarray:
+            low, high = self._bounds(change, n)
+            slack = SLACK * (1 + np.abs(velocity))
+            return (low <= high + SLACK).all(0) & (low.sum(0) <= -velocity + slack) & (high.sum(0) >= -velocity - slack)
+
+        few, many = np.full(len(change), -1), np.zeros(len(change), int)
+        ok = enough(many)
+        while not ok.all() and many.max() < MAX_STOP:
+            few, many = np.where(ok, few, many), np.where(ok, many, 2 * many + 1)
+            ok = enough(many)
+        reachable = ok
+        while (reachable & (many - few > 1)).any():
+            middle = np.maximum((few + many) // 2, 0)
+            ok = enough(middle)
+            few, many = np.where(ok, few, middle), np.where(ok, middle, many)
+        return np.where(reachable, many, -1)
+
+    def _bounds(self, change: np.ndarray, n: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+        """The least and largest accelerations of steps 1 to n from this one to rest: [steps, columns], zeros after n.
+
+        Without steps the column must rest already, within the jerk: a row that cannot be says so by crossed bounds.
+        """
+        i = np.arange(1, max(int(n.max()), 0) + 2)[:, None]
+        forth, back = i * self._jerk, np.maximum(n + 1 - i, 0) * self._jerk
+        low = np.maximum(np.maximum(-self._acceleration, change - forth), -back)
+        high = np.minimum(np.minimum(self._acceleration, change + forth), back)
+        after = i > n + 1
+        return np.where(after, 0.0, low), np.where(after, 0.0, high)
+
+
+def _padded(steps: np.ndarray, n: int) -> np.ndarray:
+    return np.concatenate([steps, np.zeros((n - len(steps), steps.shape[1]))])
+
+
+def _scale(kind: str, rate_hz: float) -> Tuple[float, float, float]:
+    """Factors from units and seconds to changes a step: of velocity, acceleration and jerk."""
+    first = 1.0 if kind == "velocity" else 1 / rate_hz
+    return first, first / rate_hz, first / rate_hz**2
+
+
+def _or(value: Optional[float], other: float) -> float:
+    return other if value is None else value
+
+
+def _number(where: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= FAR:
+        raise UsageError(where, f"a number up to {FAR:g}", str(value)[:80])
+    return float(value)
+
+
+def _each_once(pairs: List[Tuple[str, Any]]) -> Dict[str, Any]:
+    if len(dict(pairs)) < len(pairs):
+        raise ValueError("a name twice in one object")
+    return dict(pairs)
+
+
+def _refuse_constant(text: str) -> None:
+    raise ValueError(f"{text} is no number of JSON")
+
+
+def _parse_column(name: str, given: Any) -> Column:
+    where = f"limits.{name}"
+    known = {"kind", "unit", "range", "velocity", "acceleration", "jerk"}
+    if not isinstance(given, dict) or not {"kind", "unit"} <= set(given) <= known:
+        raise UsageError(where, f'an object with kind and unit, and of {", ".join(sorted(known - {"kind", "unit"}))} what is limited', str(given)[:80])
+    if not isinstance(given["unit"], str):
+        raise UsageError(f"{where}.unit", "a text", str(given["unit"])[:80])
+    span = given.get("range", [None, None])
+    if not isinstance(span, list) or len(span) != 2:
+        raise UsageError(f"{where}.range", "[least, largest]", str(span)[:80])
+    low, high = (None if end is None else _number(f"{where}.range", end) for end in span)
+    most = {field: _number(f"{where}.{field}", given[field]) for field in ("velocity", "acceleration", "jerk") if field in given}
+    return Column(name, given["kind"], given["unit"], low, high, **most)
+
+
+def _document(column: Column) -> Dict[str, Any]:
+    fields = {key: value for key, value in asdict(column).items() if value is not None and key not in ("name", "low", "high")}
+    if column.low is not None or column.high is not None:
+        fields["range"] = [column.low, column.high]
+    return fields
+
+
+def _check(column: Column) -> None:
+    where = f"limits.{column.name}"
+    if column.kind not in KINDS:
+        raise UsageError(f"{where}.kind", f'one of {", ".join(KINDS)}', str(column.kind))
+    for field in ("velocity", "acceleration", "jerk"):
+        value = getattr(column, field)
+        if value is not None and not 0 < value <= FAR:
+            raise UsageError(f"{where}.{field}", "a number above 0", str(value))
+    low, high = _or(column.low, -FAR), _or(column.high, FAR)
+    if not low < high:
+        raise UsageError(f"{where}.range", "the least below the largest", f"[{column.low}, {column.high}]")
+    if column.kind != "position" and not low <= 0 <= high:
+        raise UsageError(f"{where}.range", f"zero in the range of a {column.kind}: the robot has to be able to stop", f"[{column.low}, {column.high}]")
+
+
+def _check_names(given: Mapping[str, Any], spec: Spec) -> None:
+    missing = [name for name in spec.action_names if name not in given]
+    extra: List[str] = [name for name in given if name not in spec.action_names]
+    if not spec.action_names or missing or extra:
+        found = f"without {', '.join(missing)}" if missing else f"with {', '.join(extra)}" if extra else "a policy whose actions have no names"
+        raise UsageError("limits", f"the actions of {spec.bundle.name}: {', '.join(spec.action_names)}", found)
