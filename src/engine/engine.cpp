@@ -82,7 +82,8 @@ Status Engine::open_robots(Bundle file, const EngineOptions& options) {
 /// All that an act needs.
 Status Engine::build(const WeightPlan& plan, bool dry) {
   VLA_CHECK(device_->load(params(), !dry, plan));
-  for (const auto& robot : robots_) VLA_CHECK(robot->compute_constants(*device_, dry));
+  const PlanContext context = {*device_, tap_pattern_, dry, nullptr, see_graph_, see_tap_};
+  for (const auto& robot : robots_) VLA_CHECK(robot->compute_constants(context));
   return make_plans(dry);
 }
 

@@ -24,12 +24,13 @@ struct EngineOptions {
   /// Values that replace the computed ones at taps: those of the network, or `pixels` and `state`.
   std::vector<Tap> inject = {};
   bool dry = false;  // reserve memory without filling it: sizes are exact, and `act` must not be called
-  std::vector<std::string> absent = {};              // views that no observation will have
-  std::string embodiment = {};                       // the robot's tag; empty if the bundle is for one robot
-  bool all_robots = false;                           // loads every robot of the bundle; then `embodiment` is empty
-  std::function<void(const Graph&)> see_graph = {};  // called with the graphs of every plan before they are lowered
-  /// Receives values at taps, most of them as soon as they are computed. ActionChunk::taps, which would keep all of
-  /// them, stays empty.
+  std::vector<std::string> absent = {};  // views that no observation will have
+  std::string embodiment = {};           // the robot's tag; empty if the bundle is for one robot
+  bool all_robots = false;               // loads every robot of the bundle; then `embodiment` is empty
+  /// Called with the graphs of what is computed at load and of every plan, before they are lowered.
+  std::function<void(const Graph&)> see_graph = {};
+  /// Receives values at taps, most of them as soon as they are computed, and on the CPU those of what is computed at
+  /// load. ActionChunk::taps, which would keep all of them, stays empty.
   TapVisitor see_tap = {};
   std::size_t memory = 0;  // budget in bytes for the process, or for the policy on a GPU; 0: no limit
 };

@@ -11,11 +11,19 @@ namespace {
 
 constexpr int kMaxHorizon = 4096;
 
+/// The values that `see_tap` receives. Without it none, since no act returns taps of what was computed at load.
+TapFilter filter_of(const PlanContext& context) {
+  if (!context.see_tap) return {};
+  return [pattern = context.tap_pattern](const std::string& path) { return match_path(pattern, path); };
+}
+
 /// Load rate: lowers a graph, runs it once and drops it.
-Status run_once(const Graph& graph, Device& device, bool dry) {
-  VLA_CHECK(device.allocate(graph.slots()));
-  VLA_TRY(const std::unique_ptr<Program> program, device.lower(graph));
-  return dry ? Status() : program->run();
+Status run_once(const Graph& graph, const PlanContext& context) {
+  if (context.see_graph) context.see_graph(graph);
+  VLA_CHECK(context.device.allocate(graph.slots()));
+  VLA_TRY(const std::unique_ptr<Program> program,
+          context.device.lower(graph, {.varying = {}, .see_tap = context.see_tap}));
+  return context.dry ? Status() : program->run();
 }
 
 }  // namespace
@@ -47,36 +55,36 @@ Status Robot::read_policy() {
   return policy_->check(largest_shape());
 }
 
-Status Robot::compute_constants(Device& device, bool dry) {
-  VLA_CHECK(make_conditions(device, dry));
+Status Robot::compute_constants(const PlanContext& context) {
+  VLA_CHECK(make_conditions(context));
   constant_slots_ = Slots(), constants_ = Cache();
   const Recipe& recipe = processor_.recipe();
-  Graph graph(constant_slots_);
+  Graph graph(constant_slots_, filter_of(context));
   const auto absent_view = [&] {
     return graph.constant(processor_.absent_view(), {recipe.width, recipe.height, 3, 1});
   };
   policy_->constants(graph, absent_view, constants_);
-  return graph.nodes().empty() ? Status() : run_once(graph, device, dry);
+  return graph.nodes().empty() ? Status() : run_once(graph, context);
 }
 
 /// Computes the table of everything that depends on time only.
-Status Robot::make_conditions(Device& device, bool dry) {
+Status Robot::make_conditions(const PlanContext& context) {
   tables_ = Slots();
   conditions_ = nullptr;
-  Graph graph(tables_);
+  Graph graph(tables_, filter_of(context));
   const Tensor computed = policy_->condition(graph, solver_.times);
   if (!computed) return {};
   Slot* table = tables_.add_f32(computed.shape());
   graph.write(computed, table);
   conditions_ = table;
-  return run_once(graph, device, dry);
+  return run_once(graph, context);
 }
 
 Status Robot::set_steps(int n_step, Device& device, bool dry) {
   Keys keys = bundle_.keys();
   keys.set("solver.steps", std::int64_t{n_step});
   VLA_TRY(solver_, Solver::read(keys));
-  return make_conditions(device, dry);
+  return make_conditions({device, {}, dry});
 }
 
 InputShape Robot::largest_shape() const {

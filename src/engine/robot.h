@@ -55,9 +55,9 @@ class Robot {
   /// `bundle` is that of one robot. `other` is an earlier robot of the same file, which shares parameters and
   /// tokenizer, or null. Errors: bad_bundle, unsupported.
   static Result<std::unique_ptr<Robot>> open(Bundle bundle, const Robot* other);
-  /// Load rate: computes what every plan starts from. The device must have the parameters; with `dry` nothing is
-  /// computed. Errors: bad_bundle, unsupported, out_of_memory, device.
-  Status compute_constants(Device& device, bool dry);
+  /// Load rate: computes what every plan starts from. The device must have the parameters. Errors: bad_bundle,
+  /// unsupported, out_of_memory, device.
+  Status compute_constants(const PlanContext& context);
   /// Removes keys that were kept to compare later robots with.
   void forget_tokenizer() { bundle_.forget("tokenizer."); }
   /// Removes a view that this robot does not have from what observations must give. Errors: usage.
@@ -94,7 +94,7 @@ class Robot {
  private:
   Robot(Bundle bundle, Processor processor, const Robot* other);
   Status read_policy();
-  Status make_conditions(Device& device, bool dry);
+  Status make_conditions(const PlanContext& context);
   Status check_leftover(const Observation& observation, const Leftover& leftover, Inputs& inputs) const;
   ChunkShape chunk_shape() const;
   std::uint32_t view_key(std::uint32_t views) const;

@@ -47,7 +47,7 @@ class DryPolicy {
   /// Loads with this plan.
   Status load(const WeightPlan& plan) {
     VLA_CHECK(device_->load(robot_->params(), false, plan));
-    return robot_->compute_constants(*device_, true);
+    return robot_->compute_constants({*device_, {}, true});
   }
   Result<std::unique_ptr<Plan>> plan_for(const InputShape& shape) {
     return Plan::build(robot_->network(), shape, {*device_, "", true});
