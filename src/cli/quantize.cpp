@@ -185,7 +185,9 @@ Status calibrate_first(QuantizeOptions options) {
 class Trials {
  public:
   explicit Trials(const std::string& to) {
-    for (const char* ending : {".smoothed", ".smoothed.int4", ".int4", ".trial"}) files_.push_back(to + ending);
+    for (const char* bundle : {"", ".smoothed", ".some"})
+      for (const char* ending : {"", ".codes", ".int4", ".trial"})
+        if (*bundle != 0 || *ending != 0) files_.push_back(to + bundle + ending);
     remove();
     struct sigaction action = {};
     action.sa_handler = [](int signal) {

@@ -4,48 +4,63 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <filesystem>
 
 #include "quantize/hessians.h"
-#include "quantize/smoothing.h"
+#include "quantize/product_errors.h"
 
 namespace vla {
 namespace {
 
 const char* name_of(Rounding codes) { return codes == Rounding::int4 ? "int4" : "int8"; }
 
-/// A bundle that may be quantized, and how far its codes move the actions.
+/// A bundle that may be quantized, its codes, and how far they move the actions.
 struct Candidate {
   std::string bundle;
-  std::string int4 = {};  // its codes by Hessians, where they are better than plain ones
-  Moved moved = {};       // with the better codes
+  std::string files;  // its files: this and an ending
+  std::string codes = {};
+  bool by_hessians = false;  // whether codes of Hessians are better than plain ones
+  Moved moved = {};
+  std::string told = {};  // about Hessians
 };
 
 /// The steps of `calibrate` and their common state.
 class Calibration {
  public:
-  Calibration(const std::string& from, std::string to, std::span<const Judged> observations,
+  Calibration(const std::string& from, const std::string& to, std::span<const Judged> observations,
               const EngineOptions& options, const std::function<void(QuantizeProgress)>& report)
-      : to_(std::move(to)), observations_(observations), options_(options), report_(report), kept_{from} {}
+      : from_(from), to_(to), observations_(observations), options_(options), report_(report), kept_{from, to} {}
 
-  /// Smooths, with Hessians behind it if `codes` is int4, and keeps the bundle whose codes move less in the end: what
-  /// Hessians make good of plain codes' errors differs between the two.
+  /// Makes codes of three bundles and keeps the one whose codes move chunks least: as it is, with every channel divided
+  /// that stands out, and with these channels divided only in places where that helps by itself. int4 codes are those
+  /// by Hessians, since what these make good differs.
   Status smooth_channels(Rounding codes) {
-    Candidate smoothed = {to_ + ".smoothed"};
-    VLA_TRY(Smoothed done, smooth(kept_.bundle, smoothed.bundle, observations_, options_));
-    expected_ = std::move(done.chunks);
-    std::string lines[2];
-    for (Candidate* candidate : {&kept_, &smoothed}) {
-      VLA_TRY(candidate->moved, moved_by(candidate->bundle, codes));
-      if (codes == Rounding::int4) VLA_CHECK(round_by_hessians(*candidate, lines[candidate == &smoothed]));
+    VLA_TRY(Smoothing found, find_smoothing(from_, observations_, options_));
+    expected_ = std::move(found.chunks);
+    VLA_CHECK(make_codes(kept_, codes));
+    const Moved before = kept_.moved;
+    Moved after = before;
+    std::vector<Scaling> taken = std::move(found.scalings);
+    if (!taken.empty()) {
+      Candidate all = {.bundle = to_ + ".smoothed", .files = to_ + ".smoothed"};
+      VLA_CHECK(write_smoothed(from_, all.bundle, taken));
+      VLA_CHECK(make_codes(all, codes));
+      VLA_TRY(std::vector<Scaling> helpful,
+              helpful_scalings(from_, {kept_.codes, all.codes}, codes, taken, observations_, options_));
+      after = all.moved;
+      keep_better(std::move(all));
+      if (!helpful.empty() && helpful.size() < taken.size()) {
+        Candidate some = {.bundle = to_ + ".some", .files = to_ + ".some"};
+        VLA_CHECK(write_smoothed(from_, some.bundle, helpful));
+        VLA_CHECK(make_codes(some, codes));
+        if (some.moved.rms < after.rms) after = some.moved, taken = std::move(helpful);
+        keep_better(std::move(some));
+      }
     }
-    const bool helps = smoothed.moved.rms < kept_.moved.rms;
-    tell(fmt::format("{} channels of {} norms and MLPs divided, by {:g} at most; {} moves", done.n_channel,
-                     done.n_place, done.largest, name_of(codes)),
-         "smoothed", kept_.moved, smoothed.moved);
-    drop(helps ? kept_.int4 : smoothed.bundle), drop(helps ? "" : smoothed.int4);
-    if (helps) kept_ = std::move(smoothed);
-    if (codes == Rounding::int4) take(lines[helps], !kept_.int4.empty());
+    take(line_of(text_of(taken, found.n_place) + name_of(codes) + " moves", "smoothed", before, after),
+         after.rms < before.rms);
+    if (codes == Rounding::int4) take(kept_.told, kept_.by_hessians);
     return {};
   }
 
@@ -56,67 +71,83 @@ class Calibration {
       float32.kernels = "float32";
       VLA_TRY(expected_, chunks_of(kept_.bundle, float32, observations_));
     }
-    VLA_TRY(kept_.moved, moved_by(kept_.bundle, Rounding::int4));
-    std::string line;
-    VLA_CHECK(round_by_hessians(kept_, line));
-    take(line, !kept_.int4.empty());
+    VLA_CHECK(make_codes(kept_, Rounding::int4));
+    take(kept_.told, kept_.by_hessians);
     return {};
   }
 
   Calibrated result() {
-    made_.bundle = std::move(kept_.bundle), made_.int4 = std::move(kept_.int4);
+    made_.bundle = kept_.bundle;
+    if (kept_.by_hessians)
+      made_.int4 = kept_.codes;
+    else
+      drop(kept_.codes);
     return std::move(made_);
   }
 
  private:
   static void drop(const std::string& file) {
     std::error_code ignored;
-    if (!file.empty()) std::filesystem::remove(file, ignored);
+    std::filesystem::remove(file, ignored);
+  }
+  void keep_better(Candidate&& candidate) {
+    if (candidate.moved.rms < kept_.moved.rms) std::swap(candidate, kept_);
+    drop(candidate.codes);
+    if (candidate.bundle != from_) drop(candidate.bundle);
   }
 
-  /// Replaces plain codes of int4 by those that Hessians give, if these move chunks less. `line` says so.
-  Status round_by_hessians(Candidate& candidate, std::string& line) {
-    const std::string to = (candidate.bundle == kept_.bundle ? to_ : candidate.bundle) + ".int4";
+  /// Makes plain codes, and for int4 also those that Hessians give, and keeps those that move chunks less.
+  Status make_codes(Candidate& candidate, Rounding codes) {
+    candidate.codes = candidate.files + ".codes";
+    VLA_TRY(candidate.moved, moved_by(candidate.bundle, candidate.codes, codes, {}));
+    if (codes != Rounding::int4) return {};
+    const std::string to = candidate.files + ".int4";
     VLA_TRY(Hessians hessians, Hessians::of(candidate.bundle, observations_, options_));
-    const Int4Codes codes = {
+    const Int4Codes compensated = {
         [&](const Bundle& bundle, const TensorInfo& tensor) { return hessians.feedback(bundle, tensor); }};
-    if (const auto made = quantize(candidate.bundle, to, all_as(Rounding::int4), {}, report_, codes); !made)
-      return made.error();
-    VLA_TRY(const Chunks chunks, chunks_of(to, options_, observations_));
-    const Moved after = moved(expected_, chunks);
-    line = line_of(fmt::format("errors of {} of {} matrices made good by later columns (GPTQ); int4 moves",
-                               hessians.n_known(), hessians.n_asked()),
-                   "rounded by Hessians", candidate.moved, after);
-    if (after.rms < candidate.moved.rms)
-      candidate.moved = after, candidate.int4 = to;
-    else
+    VLA_TRY(const Moved after, moved_by(candidate.bundle, to, codes, compensated));
+    candidate.told = line_of(fmt::format("errors of {} of {} matrices made good by later columns (GPTQ); int4 moves",
+                                         hessians.n_known(), hessians.n_asked()),
+                             "rounded by Hessians", candidate.moved, after);
+    candidate.by_hessians = after.rms < candidate.moved.rms;
+    if (!candidate.by_hessians) {
       drop(to);
+      return {};
+    }
+    drop(candidate.codes);
+    candidate.moved = after, candidate.codes = to;
     return {};
   }
 
-  /// How far one kind of codes alone moves the chunks.
-  Result<Moved> moved_by(const std::string& bundle, Rounding codes) {
-    const std::string trial = to_ + ".trial";
-    if (const auto made = quantize(bundle, trial, all_as(codes), {}, [](QuantizeProgress) {}); !made)
-      return made.error();
-    VLA_TRY(const Chunks chunks, chunks_of(trial, options_, observations_));
+  /// Writes codes of all matrices and returns how far they move the chunks.
+  Result<Moved> moved_by(const std::string& bundle, const std::string& to, Rounding codes, const Int4Codes& int4) {
+    const auto report = int4.feedback ? report_ : [](QuantizeProgress) {};  // plain codes take moments
+    if (const auto made = quantize(bundle, to, all_as(codes), {}, report, int4); !made) return made.error();
+    VLA_TRY(const Chunks chunks, chunks_of(to, options_, observations_));
     return moved(expected_, chunks);
   }
 
+  static std::string text_of(std::span<const Scaling> scalings, int n_place) {
+    std::ptrdiff_t n_channel = 0;
+    float largest = 1;
+    for (const Scaling& scaling : scalings) {
+      n_channel += std::ranges::count_if(scaling.by, [](float by) { return by != 1; });
+      largest = std::max(largest, std::ranges::max(scaling.by));
+    }
+    return fmt::format("{} channels of {} of {} norms and MLPs divided, by {:g} at most; ", n_channel, scalings.size(),
+                       n_place, largest);
+  }
   std::string line_of(const std::string& done, const char* name, const Moved& before, const Moved& after) const {
     return fmt::format("{}{} over {} observations: {} chunks by {:.3f} % instead of {:.3f} %",
                        after.rms < before.rms ? "" : "not ", name, observations_.size(), done, 100 * after.rms,
                        100 * before.rms);
-  }
-  void tell(const std::string& done, const char* name, const Moved& before, const Moved& after) {
-    take(line_of(done, name, before, after), after.rms < before.rms);
   }
   void take(const std::string& line, bool helps) {
     made_.told.push_back(line);
     if (helps) made_.why += (made_.why.empty() ? "" : "; ") + line;
   }
 
-  const std::string to_;
+  const std::string from_, to_;
   const std::span<const Judged> observations_;
   const EngineOptions& options_;
   const std::function<void(QuantizeProgress)>& report_;

@@ -14,9 +14,9 @@ struct Calibrated {
   std::vector<std::string> told;  // what was tried
 };
 
-/// Tries smoothing (smoothing.h) for matrices in `codes`, then int4 codes by Hessians (hessians.h) if `has_int4`, and
-/// keeps what moves the observations' chunks less. Its files are `to` plus an ending. `options`: of the engines.
-/// Errors: those of `smooth`, Hessians and `quantize`.
+/// Tries smoothing (smoothing.h) for matrices in `codes`, everywhere and where it helps by itself (product_errors.h),
+/// then int4 codes by Hessians (hessians.h) if `has_int4`, and keeps what moves the observations' chunks less. Its
+/// files are `to` plus an ending. `options`: of the engines. Errors: those of `smooth`, Hessians and `quantize`.
 Result<Calibrated> calibrate(const std::string& from, const std::string& to, Rounding codes, bool has_int4,
                              std::span<const Judged> observations, const EngineOptions& options,
                              const std::function<void(QuantizeProgress)>& report);

@@ -121,36 +121,29 @@ void multiply(std::vector<float>& factors, const std::vector<float>& by, bool in
   for (std::size_t i = 0; i < by.size(); ++i) factors[i] *= inverse ? 1 / by[i] : by[i];
 }
 
-/// Factors by the tensors' place in the file, since robots of a bundle share tensors.
-class Scaling {
+/// Makes scalings of places. Parameters become tensors by their place in the file, since robots of a bundle share
+/// tensors.
+class Scalings {
  public:
-  Scaling(const Bundle& bundle, const Bundle& opened) : opened_(opened), scaler_(bundle) {
+  Scalings(const Bundle& bundle, const Bundle& opened) : opened_(opened), scaler_(bundle) {
     for (const TensorInfo& tensor : bundle.tensors()) by_offset_[bundle.offset(tensor.data.data())] = &tensor;
   }
 
-  Status add(const SmoothingPlace& place, const std::vector<float>& range, Smoothed& told) {
+  Result<Scaling> of(const SmoothingPlace& place, const std::vector<float>& range) {
+    Scaling made = {.path = place.path};
     std::vector<float> w(range.size());
-    for (const Param* matrix : place.readers)
+    for (const Param* matrix : place.readers) {
+      made.readers.push_back(tensor_of(matrix).name);
       VLA_CHECK(scaler_.each_row(tensor_of(matrix), [&](std::int64_t, std::span<float> row) {
         for (std::size_t k = 0; k < row.size(); ++k) w[k] = std::max(w[k], std::abs(row[k]));
       }));
-    const std::vector<float> by = divisors(range, w);
-    for (const Param* matrix : place.readers) multiply(factors_[&tensor_of(matrix)].columns, by, false);
-    for (const Param* param : {place.weight, place.bias}) {
-      if (param == nullptr) continue;
-      Factors& factors = factors_[&tensor_of(param)];
-      multiply(param->storage == Storage::matrix ? factors.rows : factors.columns, by, true);
     }
-    ++told.n_place;
-    for (const float factor : by) told.n_channel += factor != 1, told.largest = std::max(told.largest, factor);
-    return {};
+    made.by = divisors(range, w);
+    for (const Param* param : {place.weight, place.bias})
+      if (param != nullptr)
+        (param->storage == Storage::matrix ? made.rows : made.vectors).push_back(tensor_of(param).name);
+    return made;
   }
-
-  const Factors* find(const TensorInfo& tensor) const {
-    const auto found = factors_.find(&tensor);
-    return found != factors_.end() ? &found->second : nullptr;
-  }
-  Scaler& scaler() { return scaler_; }
 
  private:
   const TensorInfo& tensor_of(const Param* param) const {
@@ -160,51 +153,69 @@ class Scaling {
   const Bundle& opened_;  // the bundle that owns the parameters
   Scaler scaler_;
   std::map<std::ptrdiff_t, const TensorInfo*> by_offset_;
-  std::map<const TensorInfo*, Factors> factors_;
 };
 
-Status write_tensors(const Bundle& bundle, Scaling& scaling, BundleFile& out) {
+/// By the tensor's name.
+std::map<std::string, Factors> factors_of(std::span<const Scaling> scalings) {
+  std::map<std::string, Factors> factors;
+  for (const Scaling& scaling : scalings) {
+    for (const std::string& matrix : scaling.readers) multiply(factors[matrix].columns, scaling.by, false);
+    for (const std::string& vector : scaling.vectors) multiply(factors[vector].columns, scaling.by, true);
+    for (const std::string& matrix : scaling.rows) multiply(factors[matrix].rows, scaling.by, true);
+  }
+  return factors;
+}
+
+Status write_tensors(const Bundle& bundle, const std::map<std::string, Factors>& factors, BundleFile& out) {
+  Scaler scaler(bundle);
   for (const TensorInfo& tensor : bundle.tensors()) {
-    const Factors* const factors = scaling.find(tensor);
-    VLA_CHECK(factors != nullptr ? scaling.scaler().write(tensor, *factors, out)
-                                 : out.copy(bundle, tensor, [](std::size_t) {}));
+    const auto found = factors.find(tensor.name);
+    VLA_CHECK(found != factors.end() ? scaler.write(tensor, found->second, out)
+                                     : out.copy(bundle, tensor, [](std::size_t) {}));
   }
   return {};
 }
 
 }  // namespace
 
-Result<Smoothed> smooth(const std::string& from, const std::string& to, std::span<const Judged> observations,
-                        EngineOptions options) {
+Result<Smoothing> find_smoothing(const std::string& bundle, std::span<const Judged> observations,
+                                 EngineOptions options) {
   options.kernels = "float32";
   SmoothingPlaces finder;
   VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(from, {.n_thread = options.n_thread,
-                              .kernels = options.kernels,
-                              .dry = true,
-                              .all_robots = options.all_robots,
-                              .see_graph = [&](const Graph& graph) { finder.see(graph); }}));
+          Engine::load(bundle, {.n_thread = options.n_thread,
+                                .kernels = options.kernels,
+                                .dry = true,
+                                .all_robots = options.all_robots,
+                                .see_graph = [&](const Graph& graph) { finder.see(graph); }}));
   const std::vector<SmoothingPlace> places = finder.found();
   if (places.empty())
-    return Error{Code::unsupported, from, "norms or gated MLPs whose channels may be divided", "none",
+    return Error{Code::unsupported, bundle, "norms or gated MLPs whose channels may be divided", "none",
                  "leave out --calibrate"};
-  Smoothed told;
-  VLA_TRY(const Ranges ranges, measure_ranges(from, places, observations, options, told.chunks));
+  Smoothing found = {.n_place = static_cast<int>(places.size())};
+  VLA_TRY(const Ranges ranges, measure_ranges(bundle, places, observations, options, found.chunks));
+  VLA_TRY(const Bundle file, Bundle::open(bundle));
+  Scalings scalings(file, engine->robot().bundle());
+  for (const SmoothingPlace& place : places) {
+    const auto range = ranges.find(place.path);
+    if (range == ranges.end()) continue;
+    VLA_TRY(Scaling made, scalings.of(place, range->second));
+    if (std::ranges::any_of(made.by, [](float by) { return by != 1; })) found.scalings.push_back(std::move(made));
+  }
+  return found;
+}
+
+Status write_smoothed(const std::string& from, const std::string& to, std::span<const Scaling> scalings) {
   VLA_TRY(const Bundle bundle, Bundle::open(from));
-  Scaling scaling(bundle, engine->robot().bundle());
-  for (const SmoothingPlace& place : places)
-    if (const auto range = ranges.find(place.path); range != ranges.end())
-      VLA_CHECK(scaling.add(place, range->second, told));
   Keys keys = bundle.keys();
   keys.set("vla.checksum", std::string(kNoChecksum));
   Status made;
   VLA_CHECK(write_file(to, [&](int file) {
     BundleFile out(file, keys, bundle.tensors());
-    made = write_tensors(bundle, scaling, out);
+    made = write_tensors(bundle, factors_of(scalings), out);
     return made && out.seal();
   }));
-  VLA_CHECK(made);
-  return told;
+  return made;
 }
 
 }  // namespace vla

@@ -116,12 +116,13 @@ TEST_CASE("a smoothed policy acts as before in float32, to the bit") {
     const GoldenCase golden = GoldenCase::read(name);
     const std::string to = write_file("smoothed.gguf", "");
     const Judged seen = {golden.observation, golden.noise};
-    const auto smoothed = smooth(golden.bundle(), to, std::span(&seen, 1), {.n_thread = 1, .all_robots = true});
-    if (!smoothed) {
-      CHECK_MESSAGE(smoothed.error().code == Code::unsupported, smoothed.error().message());
+    const auto found = find_smoothing(golden.bundle(), std::span(&seen, 1), {.n_thread = 1, .all_robots = true});
+    if (!found) {
+      CHECK_MESSAGE(found.error().code == Code::unsupported, found.error().message());
       continue;
     }
-    n_smoothed += smoothed->n_channel > 0;
+    n_smoothed += !found->scalings.empty();
+    REQUIRE(write_smoothed(golden.bundle(), to, found->scalings).ok());
     const auto before = load_engine(golden.bundle(), "", "float32"), after = load_engine(to, "", "float32");
     const auto expected = before->act(golden.observation, golden.noise);
     const auto got = after->act(golden.observation, golden.noise);
