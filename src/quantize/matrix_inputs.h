@@ -11,11 +11,14 @@
 
 namespace vla {
 
-/// Whether a node returns some or all tokens of its operand with the same channels.
+/// Whether a node returns some or all tokens of its first operand with the same channels, in any order.
 bool is_view_of_channels(const Node& node);
 
+/// Whether a node is a constant of zeros, whose products are the same whatever a matrix has.
+bool is_zeros(const Node& node);
+
 /// The paths of the values that matrices multiply, by the address of the matrices' bytes. A value without a path has an
-/// empty one.
+/// empty one; zeros have none.
 using MatrixInputs = std::map<const std::byte*, std::set<std::string>>;
 /// Adds those of a graph.
 void add_inputs(const Graph& graph, MatrixInputs& to);

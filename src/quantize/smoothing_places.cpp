@@ -79,7 +79,7 @@ void SmoothingPlaces::see(const Graph& graph) {
   };
   for (const Node& node : graph.nodes()) {
     if (const auto* linear = node.as<op::Linear>()) {
-      columns_[linear->weight].insert(or_null(read_from, &node));
+      if (!is_zeros(*node.in[0].node())) columns_[linear->weight].insert(or_null(read_from, &node));
       rows_[linear->weight].insert(or_null(rows_of, &node));
       if (linear->bias != nullptr) rows_[linear->bias].insert(or_null(rows_of, &node));
     }

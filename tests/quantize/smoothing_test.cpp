@@ -6,6 +6,8 @@
 
 #include <doctest/doctest.h>
 
+#include <algorithm>
+
 #include "quantize/smoothing_places.h"
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
@@ -99,6 +101,16 @@ TEST_CASE("a norm that something else reads, or whose matrices or weights have o
   }
 }
 
+TEST_CASE("a matrix that multiplies zeros too may read a norm that is smoothed, another constant it may not") {
+  for (const float value : {0.0f, 1.0f}) {
+    CAPTURE(value);
+    Places p;
+    p.product("a", p.normed());
+    p.product("a", p.g.constant(std::vector<float>(kWidth, value), {kWidth, 1, 1, 1}));
+    CHECK(p.paths() == (value == 0 ? Paths{"n"} : Paths()));
+  }
+}
+
 TEST_CASE("rows of an MLP's up may be divided, and its columns multiplied") {
   Places p;
   const Tensor n = p.normed(), up = p.product("up", n);
@@ -131,4 +143,31 @@ TEST_CASE("a smoothed policy acts as before in float32, to the bit") {
     CHECK(got->actions == expected->actions);
   }
   CHECK(n_smoothed > 10);
+}
+
+TEST_CASE("norms that are computed at load are smoothed, by what they give at load") {
+  const GoldenCase golden = GoldenCase::read(golden_path("turbovla/two_views"));
+  SmoothingPlaces finder;
+  std::map<std::string, std::size_t> seen;
+  const std::string norm = "decoder.blk.0.attn_norm";
+  const auto engine = Engine::load(
+      golden.bundle(), {.kernels = "float32",
+                        .tap_pattern = norm,
+                        .see_graph = [&](const Graph& g) { finder.see(g); },
+                        .see_tap = [&](const std::string& path, auto, auto values) { seen[path] += values.size(); }});
+  REQUIRE(engine.ok());
+  const std::vector<SmoothingPlace> places = finder.found();
+  CHECK(std::ranges::count(places, norm, &SmoothingPlace::path) == 1);
+  CHECK(seen[norm] > 0);
+}
+
+TEST_CASE("X-VLA's keys of zeros leave the norms of its windows to be smoothed") {
+  SmoothingPlaces finder;
+  const auto engine = Engine::load(golden_path("xvla/two_views/bundle.gguf"),
+                                   {.dry = true, .see_graph = [&](const Graph& g) { finder.see(g); }});
+  REQUIRE(engine.ok());
+  const auto places = finder.found();
+  CHECK(std::ranges::count_if(places, [](const SmoothingPlace& place) {
+          return place.path.starts_with("vision.") && place.path.ends_with("spatial.attn_norm");
+        }) > 0);
 }
