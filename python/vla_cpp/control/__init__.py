@@ -3,8 +3,9 @@
 """Running action chunks on a robot: when to ask, which row to command, what to do when the answer is late (docs/control.md)."""
 
 from .blend import Blend, CrossFade, Ensemble
+from .interpolate import Interpolator
 from .limits import Column, Limiter, Limits
 from .loop import ChunkLoop, RealTimeChunking
 from .schedule import Action, ChunkSchedule
 
-__all__ = ["Action", "Blend", "ChunkLoop", "ChunkSchedule", "Column", "CrossFade", "Ensemble", "Limiter", "Limits", "RealTimeChunking"]
+__all__ = ["Action", "Blend", "ChunkLoop", "ChunkSchedule", "Column", "CrossFade", "Ensemble", "Interpolator", "Limiter", "Limits", "RealTimeChunking"]

@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""From the commands of a policy's rate to those of a faster controller.
+
+A command of a control period is reached at the end of that period, so what is interpolated comes one period later than what is not
+(`delay_s`). Within the period a position follows a polynomial from where it is to the command:
+
+    linear        of degree 1: continuous
+    cubic         of degree 3, from the velocity that it has to the mean velocity between the last two commands: continuous velocity
+    minimum_jerk  of degree 5, also from the acceleration that it has to none: continuous acceleration. Among all motions with these
+                  ends it has the least squared jerk (Flash and Hogan 1985)
+
+so a new chunk, or a late one, makes no jump either. A polynomial may pass its ends by a little where a motion turns; a Limiter at the
+controller's rate keeps that within limits. A velocity is held for its period. A difference is spread over it: its parts sum to it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Dict, Sequence, Tuple
+
+import numpy as np
+
+from ..errors import BadAction, UsageError
+from .limits import KINDS
+
+# Coefficients of s^0 ... s^5, s from 0 to 1 over a period, from: place, velocity and acceleration at 0; the same at 1.
+METHODS: Dict[str, np.ndarray] = {
+    "linear": np.array([[1, -1], [0, 0], [0, 0], [0, 1], [0, 0], [0, 0]], float).T,
+    "cubic": np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, 0, 0], [0, 0, 3, -2], [0, 0, -1, 1], [0, 0, 0, 0]], float).T,
+    "minimum_jerk": np.array(
+        [
+            [1, 0, 0, -10, 15, -6],
+            [0, 1, 0, -6, 8, -3],
+            [0, 0, 0.5, -1.5, 1.5, -0.5],
+            [0, 0, 0, 10, -15, 6],
+            [0, 0, 0, -4, 7, -3],
+            [0, 0, 0, 0.5, -1, 0.5],
+        ]
+    ).T,
+}
+
+
+class Interpolator:
+    """Commands within control periods.
+
+        between = Interpolator(["position"] * 6 + ["velocity"], method="minimum_jerk", rate_hz=20)
+        between.start_at(joints())
+        while running:                          # 20 times a second
+            action = loop.step(observe)
+            between.to(action.values)
+            for s in (0.1, 0.2, ..., 1.0):      # 200 times a second
+                command(between.at(s))
+
+    kinds    "position", "velocity" or "difference" of each column
+    method   how positions are interpolated: "linear", "cubic" or "minimum_jerk"
+    rate_hz  control periods a second
+    """
+
+    def __init__(self, kinds: Sequence[str], *, method: str, rate_hz: float) -> None:
+        if not kinds or not set(kinds) <= set(KINDS):
+            raise UsageError("kinds", f'one of {", ".join(KINDS)} for each column', str(list(kinds)))
+        if method not in METHODS:
+            raise UsageError("method", f'one of {", ".join(METHODS)}', str(method))
+        if not 0 < rate_hz < float("inf"):
+            raise UsageError("rate_hz", "periods per second, above 0", str(rate_hz))
+        self.delay_s = 1 / rate_hz
+        self._powers = METHODS[method]
+        self._is_place, self._is_velocity = (np.array([kind == each for kind in kinds]) for each in ("position", "velocity"))
+        self._command = np.full(len(kinds), np.nan)
+        self._coefficients = np.zeros((len(self._powers), len(kinds)))
+        self._s = 1.0
+
+    def start_at(self, values: Any) -> None:
+        """The robot rests at these values; of velocities and differences zero is meant."""
+        self._command = np.where(self._is_place, self._read("start_at", values), 0.0)
+        self._coefficients[:] = 0
+        self._coefficients[0] = self._command
+        self._s = 1.0
+
+    def to(self, values: Any) -> None:
+        """A control period begins, in which this command is to be reached; the one before ends where it was asked for last.
+
+        Errors: UsageError before `start_at`; BadAction for a value that is not finite.
+        """
+        wanted = self._read("command", values)
+        if np.isnan(self._command).any():
+            raise UsageError("command", "start_at first: where the robot is", "nothing")
+        place, velocity, acceleration = self._motion(self._s)
+        ends = [place, velocity, acceleration, wanted, wanted - self._command, np.zeros_like(wanted)]
+        self._coefficients = self._powers @ np.array(ends)
+        self._command, self._s = wanted, 0.0
+
+    def at(self, s: float) -> np.ndarray:
+        """The command, float32, when this share of the period is over: later than the one before, 1 at most.
+
+        Of a difference it is the part since the one before.
+        """
+        if not self._s < s <= 1:
+            raise UsageError("s", f"a share of the period above {self._s:g}, 1 at most", str(s))
+        place, _, _ = self._motion(s)
+        rest = np.where(self._is_velocity, self._command, (s - self._s) * self._command)
+        self._s = s
+        return np.where(self._is_place, place, rest).astype(np.float32)
+
+    def _motion(self, s: float) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Place, velocity and acceleration of the polynomials, in periods."""
+        n = len(self._coefficients)
+        k = np.arange(n)
+        power = [s**k, k * s ** np.maximum(k - 1, 0), k * (k - 1) * s ** np.maximum(k - 2, 0)]
+        place, velocity, acceleration = (p @ self._coefficients for p in power)
+        return place, velocity, acceleration
+
+    def _read(self, where: str, values: Any) -> np.ndarray:
+        values = np.array(values, np.float64)
+        if values.shape != self._is_place.shape or not np.isfinite(values).all():
+            raise BadAction(where, f"{len(self._is_place)} finite numbers", str(values))
+        return values
