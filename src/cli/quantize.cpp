@@ -78,8 +78,12 @@ void print(const Found& found, std::size_t n_observation) {
   for (const Block& block : found.blocks)
     say(stdout, "{:<{}}  {:<9}  {:>9}  {:>9}  {:>9}  {:>10.3f} %\n", block.path, width, name_of(block.codes),
         megabytes(block.stored), megabytes(block.int8), megabytes(block.int4), 100 * block.moved_by_int4);
-  say(stdout, "chunks of {} observations move by {} of float32's; all int8: {}; all int4: {}\n\n", n_observation,
+  say(stdout, "chunks of {} observations move by {} of float32's; all int8: {}; all int4: {}\n", n_observation,
       percent(found.moved), percent(found.all_int8), percent(found.all_int4));
+  // docs/quantization.md has the episodes.
+  say(stdout,
+      "a guide: the shipped MetaWorld policy, whose chunks move by 0.6 % in int8 and by 6.3 % in int4, solves 183 of "
+      "200 episodes in both, and 182 in float32; beyond that, try it in closed loop\n\n");
 }
 
 /// The text about a search that the bundle keeps.
@@ -97,13 +101,13 @@ Result<std::vector<Judged>> observations(const QuantizeOptions& options, const s
 }
 
 /// Codes block by block, and why.
-Result<std::pair<Choice, std::string>> choose(const QuantizeOptions& options, const Int4Codes& int4, bool shows) {
+Result<std::pair<Choice, std::string>> choose(const QuantizeOptions& options, const CodeSource& source, bool shows) {
   VLA_TRY(const std::vector<Judged> judged, observations(options, options.recording));
   const auto progress = [shows](int trial, const Moved& moved) {
     if (shows) say(stderr, "\rtrial {:>3}: {:<40}", trial, percent(moved));
   };
   VLA_TRY(const Found found,
-          search(options.from, options.to + ".trial", judged, options.bound, options.engine, int4, progress));
+          search(options.from, options.to + ".trial", judged, options.bound, options.engine, source, progress));
   if (shows) say(stderr, "\r{:<60}\r", "");
   if (!options.quiet) print(found, judged.size());
   if (std::ranges::all_of(found.blocks, [](const Block& block) { return block.codes == Rounding::none; }))
@@ -127,7 +131,7 @@ void add_search(CLI::App& command, QuantizeOptions& options) {
   add_text(command, "--calibrate", options.calibration, "DIR",
            "A recording of vla serve --record: first divide channels of activations that are far larger than the "
            "others, and multiply the matrices that read them, which leaves float32's actions as they are; then round "
-           "int4 column by column, each making good the errors of those before it. Kept is what moves actions less");
+           "column by column, each making good the errors of those before it. Kept is what moves actions less");
   error->needs(judge)->excludes(size);
   size->needs(judge)->excludes("--dtype");
   error->excludes("--dtype");
@@ -146,19 +150,19 @@ std::function<void(QuantizeProgress)> progress(bool shows) {
 }
 
 /// `why`: what was done to `options.from` before.
-Status write_codes(const QuantizeOptions& options, const Int4Codes& int4, const std::string& why) {
+Status write_codes(const QuantizeOptions& options, const CodeSource& source, const std::string& why) {
   const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
   std::pair<Choice, std::string> chosen(all_as(codes_of(options.dtype)), why);
 #ifdef VLA_SERVER
   if (!options.recording.empty()) {
     if (!options.bound.error && !options.bound.bytes)
       return Error{Code::usage, "--judge", "--error or --size", "neither"};
-    VLA_TRY(chosen, choose(options, int4, shows));
+    VLA_TRY(chosen, choose(options, source, shows));
     if (!why.empty()) chosen.second = why + "; " + chosen.second;
   }
 #endif
   VLA_TRY(const std::vector<QuantizedModule> rows,
-          quantize(options.from, options.to, chosen.first, chosen.second, progress(shows), int4));
+          quantize(options.from, options.to, chosen.first, chosen.second, progress(shows), source));
   if (shows) say(stderr, "\r{:<16}\r", "");
   if (!options.quiet) print(rows);
   return {};
@@ -175,9 +179,14 @@ Status calibrate_first(QuantizeOptions options) {
   for (const std::string& line : made.told)
     if (!options.quiet) say(stdout, "{}\n\n", line);
   options.from = made.bundle;
-  if (made.int4.empty()) return write_codes(options, {}, made.why);
-  VLA_TRY(const Bundle int4, Bundle::open(made.int4));
-  return write_codes(options, {.feedback = {}, .made = &int4}, made.why);
+  std::vector<Bundle> bundles;
+  for (const std::string& file : made.codes) {
+    VLA_TRY(Bundle bundle, Bundle::open(file));
+    bundles.push_back(std::move(bundle));
+  }
+  CodeSource source;
+  for (const Bundle& bundle : bundles) source.made.push_back(&bundle);
+  return write_codes(options, source, made.why);
 }
 
 /// The bundles that are made on the way, beside the result: gone before it begins, since a program that was killed may
@@ -186,7 +195,7 @@ class Trials {
  public:
   explicit Trials(const std::string& to) {
     for (const char* bundle : {"", ".smoothed", ".some"})
-      for (const char* ending : {"", ".codes", ".int4", ".trial"})
+      for (const char* ending : {"", ".codes", ".int8", ".int4", ".trial"})
         if (*bundle != 0 || *ending != 0) files_.push_back(to + bundle + ending);
     remove();
     struct sigaction action = {};

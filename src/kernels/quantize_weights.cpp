@@ -90,27 +90,50 @@ float fitted_scale(const float* row, const Int4Block* blocks, std::int64_t n, fl
   return square > 0 ? static_cast<float>(product / square) : otherwise;
 }
 
-/// What all blocks of a row share.
-struct Int4Row {
-  float unit;  // steps are multiples of it
+/// A row of floats, to be rounded.
+struct WideRow {
+  float unit;  // of codes: the largest magnitude over its code; 0 for a row of zeros
   bool is_finite;
 };
 
-/// Widens a row; a row that is not finite, or nearly zero, becomes zeros.
-Int4Row widen_for_int4(DType type, const std::byte* stored, std::int64_t d_in, float* row) {
+constexpr float kInt8Codes = 127, kInt4Codes = Int4Block::kMost * Int4Block::kMaxStep;
+
+/// Widens a row; a row that is not finite, or nearly zero, becomes zeros. n_code: of the largest magnitude.
+WideRow widen_row(DType type, const std::byte* stored, std::int64_t d_in, float n_code, float* row) {
   const float max_abs = widen(type, stored, d_in, row);
   const bool is_finite = max_abs <= std::numeric_limits<float>::max();
   const bool is_zero = !is_finite || max_abs <= kMinScale;
   if (is_zero) std::fill(row, row + d_in, 0.0f);
-  return {is_zero ? 0 : max_abs / (Int4Block::kMost * Int4Block::kMaxStep), is_finite};
+  return {is_zero ? 0 : max_abs / n_code, is_finite};
+}
+
+/// Widens all rows into `rows`. Returns their units; `scales` receives them, or NaN for a row that is not finite.
+std::vector<float> widen_rows(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, float n_code,
+                              float* scales, float* rows) {
+  std::vector<float> units;
+  for (std::int64_t n = 0; n < d_out; ++n) {
+    const WideRow of = widen_row(type, stored + n * d_in * number_size(type), d_in, n_code, rows + n * d_in);
+    units.push_back(of.unit);
+    scales[n] = of.is_finite ? of.unit : std::numeric_limits<float>::quiet_NaN();
+  }
+  return units;
 }
 
 /// Rounds some rows of a stretch of columns, where later columns compensate the errors of earlier ones.
 class Stretch {
  public:
-  /// rows: the first row's element of the first column; feedback: [n, n].
+  /// rows: the first row's element of the first column; units: of each row, a code's in int8, a step's in int4;
+  /// feedback: [n, n].
   Stretch(const float* rows, std::int64_t d_in, std::span<const float> units, const float* feedback, std::int64_t n)
       : rows_(rows), d_in_(d_in), units_(units), feedback_(feedback), n_(n), asked_(units.size() * size(n)) {}
+
+  /// Makes int8 codes of each row. codes: the first row's code of the first column.
+  void round(std::byte* codes) {
+    for (std::size_t k = 0; k < size(n_); ++k)
+      for (std::size_t r = 0; r < units_.size(); ++r)
+        codes[static_cast<std::int64_t>(r) * d_in_ + static_cast<std::int64_t>(k)] =
+            static_cast<std::byte>(static_cast<int>(round(r, k, units_[r], 127)));
+  }
 
   /// Makes the blocks of each row that start at column `begin`. blocks: those of the first row.
   void round(std::int64_t begin, Int4Block* blocks) {
@@ -126,7 +149,7 @@ class Stretch {
     // The inner loop runs over rows, so each row of the feedback is read once.
     for (std::size_t k = 0; k < n; ++k)
       for (std::size_t r = 0; r < units_.size(); ++r)
-        codes[r * kElements + k] = round(r, first + k, static_cast<float>(steps[r]) * units_[r]);
+        codes[r * kElements + k] = round(r, first + k, static_cast<float>(steps[r]) * units_[r], Int4Block::kMost);
     for (std::size_t r = 0; r < units_.size(); ++r)
       blocks[static_cast<std::int64_t>(r) * Int4Block::n_of(d_in_)] = packed(steps[r], codes.data() + r * kElements);
   }
@@ -137,12 +160,11 @@ class Stretch {
   const float* row(std::size_t r) const { return rows_ + static_cast<std::int64_t>(r) * d_in_; }
   float* asked(std::size_t r) { return asked_.data() + r * size(n_); }
 
-  /// Rounds one element and adds its error's compensation to later columns of the row.
-  float round(std::size_t r, std::size_t k, float step) {
-    constexpr auto kMost = static_cast<float>(Int4Block::kMost);
+  /// Rounds one element and adds its error's compensation to later columns of the row. most: the largest code.
+  float round(std::size_t r, std::size_t k, float step, float most) {
     float* const more = asked(r);
     const float wanted = row(r)[k] + more[k];
-    const float code = step > 0 ? std::min(std::max(wanted / step + kRound - kRound, -kMost), kMost) : 0;
+    const float code = step > 0 ? std::min(std::max(wanted / step + kRound - kRound, -most), most) : 0;
     const float error = row(r)[k] - code * step;
     const float* const of_error = feedback_ + k * size(n_);
     for (std::size_t j = k + 1; j < size(n_); ++j) more[j] += error * of_error[j];
@@ -175,7 +197,7 @@ void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, st
                       float* scales, float* row) {
   const std::int64_t n_block = Int4Block::n_of(d_in);
   for (std::int64_t n = 0; n < d_out; ++n, stored += d_in * number_size(type), blocks += n_block) {
-    const Int4Row of = widen_for_int4(type, stored, d_in, row);
+    const WideRow of = widen_row(type, stored, d_in, kInt4Codes, row);
     std::fill(row + d_in, row + n_block * Int4Block::kElements, 0.0f);
     float codes[Int4Block::kElements];
     for (std::int64_t i = 0; i < n_block; ++i) {
@@ -187,13 +209,18 @@ void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, st
 }
 
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, const float* feedback,
-                      Int4Block* blocks, float* scales, float* rows) {
-  std::vector<float> units;
-  for (std::int64_t n = 0; n < d_out; ++n) {
-    const Int4Row of = widen_for_int4(type, stored + n * d_in * number_size(type), d_in, rows + n * d_in);
-    units.push_back(of.unit);
-    scales[n] = of.is_finite ? of.unit : std::numeric_limits<float>::quiet_NaN();
+                      std::byte* codes, float* scales, float* rows) {
+  const std::vector<float> units = widen_rows(type, stored, d_in, d_out, kInt8Codes, scales, rows);
+  for (std::int64_t first = 0; first < d_in; first += kStretch) {
+    const std::int64_t n = std::min(kStretch, d_in - first);
+    Stretch(rows + first, d_in, units, feedback, n).round(codes + first);
+    feedback += n * n;
   }
+}
+
+void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, const float* feedback,
+                      Int4Block* blocks, float* scales, float* rows) {
+  const std::vector<float> units = widen_rows(type, stored, d_in, d_out, kInt4Codes, scales, rows);
   for (std::int64_t first = 0; first < d_in; first += kStretch) {
     const std::int64_t n = std::min(kStretch, d_in - first);
     Stretch stretch(rows + first, d_in, units, feedback, n);

@@ -20,10 +20,12 @@ void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, st
 /// Columns of different stretches of this many columns are rounded independently.
 constexpr std::int64_t kStretch = 1024;
 
-/// The same if it is known what the matrix multiplies, so that later columns can compensate an error in an earlier one.
+/// Both if it is known what the matrix multiplies, so that later columns can compensate an error in an earlier one.
 /// feedback: for each stretch of n <= kStretch columns an [n, n] matrix, whose row j says what to add to columns k > j
-/// for an error of 1 in column j. A block's step is chosen from its compensated values, then its codes column by
-/// column. rows: buffer for d_out * d_in floats.
+/// for an error of 1 in column j. Codes are made column by column; the step of an int4 block is chosen from its
+/// compensated values before. rows: buffer for d_out * d_in floats.
+void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, const float* feedback,
+                      std::byte* codes, float* scales, float* rows);
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, const float* feedback,
                       Int4Block* blocks, float* scales, float* rows);
 

@@ -33,8 +33,8 @@ class Calibration {
       : from_(from), to_(to), observations_(observations), options_(options), report_(report), kept_{from, to} {}
 
   /// Makes codes of three bundles and keeps the one whose codes move chunks least: as it is, with every channel divided
-  /// that stands out, and with these channels divided only in places where that helps by itself. int4 codes are those
-  /// by Hessians, since what these make good differs.
+  /// that stands out, and with these channels divided only in places where that helps by itself. Codes are those by
+  /// Hessians, since what these make good differs.
   Status smooth_channels(Rounding codes) {
     VLA_TRY(Smoothing found, find_smoothing(from_, observations_, options_));
     expected_ = std::move(found.chunks);
@@ -60,28 +60,24 @@ class Calibration {
     }
     take(line_of(text_of(taken, found.n_place) + name_of(codes) + " moves", "smoothed", before, after),
          after.rms < before.rms);
-    if (codes == Rounding::int4) take(kept_.told, kept_.by_hessians);
+    keep_codes();
     return {};
   }
 
-  /// int4 of what is kept, by Hessians.
-  Status round_kept_by_hessians() {
+  /// Codes of what is kept, by Hessians.
+  Status round_kept_by_hessians(Rounding codes) {
     if (expected_.empty()) {
       EngineOptions float32 = options_;
       float32.kernels = "float32";
       VLA_TRY(expected_, chunks_of(kept_.bundle, float32, observations_));
     }
-    VLA_CHECK(make_codes(kept_, Rounding::int4));
-    take(kept_.told, kept_.by_hessians);
+    VLA_CHECK(make_codes(kept_, codes));
+    keep_codes();
     return {};
   }
 
   Calibrated result() {
     made_.bundle = kept_.bundle;
-    if (kept_.by_hessians)
-      made_.int4 = kept_.codes;
-    else
-      drop(kept_.codes);
     return std::move(made_);
   }
 
@@ -96,18 +92,26 @@ class Calibration {
     if (candidate.bundle != from_) drop(candidate.bundle);
   }
 
-  /// Makes plain codes, and for int4 also those that Hessians give, and keeps those that move chunks less.
+  /// Takes the codes of what is kept if they are by Hessians.
+  void keep_codes() {
+    take(kept_.told, kept_.by_hessians);
+    if (kept_.by_hessians)
+      made_.codes.push_back(kept_.codes);
+    else
+      drop(kept_.codes);
+  }
+
+  /// Makes plain codes and those that Hessians give, and keeps those that move chunks less.
   Status make_codes(Candidate& candidate, Rounding codes) {
     candidate.codes = candidate.files + ".codes";
     VLA_TRY(candidate.moved, moved_by(candidate.bundle, candidate.codes, codes, {}));
-    if (codes != Rounding::int4) return {};
-    const std::string to = candidate.files + ".int4";
+    const std::string to = candidate.files + "." + name_of(codes);
     VLA_TRY(Hessians hessians, Hessians::of(candidate.bundle, observations_, options_));
-    const Int4Codes compensated = {
+    const CodeSource compensated = {
         [&](const Bundle& bundle, const TensorInfo& tensor) { return hessians.feedback(bundle, tensor); }};
     VLA_TRY(const Moved after, moved_by(candidate.bundle, to, codes, compensated));
-    candidate.told = line_of(fmt::format("errors of {} of {} matrices made good by later columns (GPTQ); int4 moves",
-                                         hessians.n_known(), hessians.n_asked()),
+    candidate.told = line_of(fmt::format("errors of {} of {} matrices made good by later columns (GPTQ); {} moves",
+                                         hessians.n_known(), hessians.n_asked(), name_of(codes)),
                              "rounded by Hessians", candidate.moved, after);
     candidate.by_hessians = after.rms < candidate.moved.rms;
     if (!candidate.by_hessians) {
@@ -120,9 +124,9 @@ class Calibration {
   }
 
   /// Writes codes of all matrices and returns how far they move the chunks.
-  Result<Moved> moved_by(const std::string& bundle, const std::string& to, Rounding codes, const Int4Codes& int4) {
-    const auto report = int4.feedback ? report_ : [](QuantizeProgress) {};  // plain codes take moments
-    if (const auto made = quantize(bundle, to, all_as(codes), {}, report, int4); !made) return made.error();
+  Result<Moved> moved_by(const std::string& bundle, const std::string& to, Rounding codes, const CodeSource& source) {
+    const auto report = source.feedback ? report_ : [](QuantizeProgress) {};  // plain codes take moments
+    if (const auto made = quantize(bundle, to, all_as(codes), {}, report, source); !made) return made.error();
     VLA_TRY(const Chunks chunks, chunks_of(to, options_, observations_));
     return moved(expected_, chunks);
   }
@@ -163,10 +167,9 @@ Result<Calibrated> calibrate(const std::string& from, const std::string& to, Rou
                              const std::function<void(QuantizeProgress)>& report) {
   Calibration calibration(from, to, observations, options, report);
   const Status smoothed = calibration.smooth_channels(codes);
-  const bool may_go_on = has_int4 && !smoothed && smoothed.error().code == Code::unsupported;
-  if (!may_go_on) VLA_CHECK(smoothed);
-  const bool has_hessians = smoothed && codes == Rounding::int4;
-  if (has_int4 && !has_hessians) VLA_CHECK(calibration.round_kept_by_hessians());
+  const bool has_no_place = !smoothed && smoothed.error().code == Code::unsupported;
+  VLA_CHECK(has_no_place ? calibration.round_kept_by_hessians(codes) : smoothed);
+  if (has_int4 && codes != Rounding::int4) VLA_CHECK(calibration.round_kept_by_hessians(Rounding::int4));
   return calibration.result();
 }
 

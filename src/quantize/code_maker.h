@@ -13,12 +13,12 @@ constexpr std::int64_t kPartRows = 64;  // of a matrix that are in memory at a t
 /// Makes the codes of a matrix, some rows at a time.
 class CodeMaker {
  public:
-  /// Makes codes of `wanted`: int8 or int4. Errors: those of `int4`.
+  /// Makes codes of `wanted`: int8 or int4. Errors: those of `source`.
   static Result<CodeMaker> open(const Bundle& bundle, const TensorInfo& matrix, const Encoding& wanted,
-                                const Int4Codes& int4);
+                                const CodeSource& source);
 
   /// Codes of `n` rows starting at `first`, whose bytes are `stored`. Codes and scales [n] are valid until the next
-  /// call. Errors: bad_bundle, for Int4Codes::made.
+  /// call. Errors: bad_bundle, for CodeSource::made.
   Result<const std::byte*> make(const std::byte* stored, std::int64_t first, std::int64_t n, float* scales);
 
  private:

@@ -74,9 +74,9 @@ struct Squares {
 /// Writes the tensors in order.
 class Writer {
  public:
-  Writer(const Bundle& bundle, const Int4Codes& int4, BundleFile& out,
+  Writer(const Bundle& bundle, const CodeSource& source, BundleFile& out,
          const std::function<void(QuantizeProgress)>& report)
-      : bundle_(bundle), int4_(int4), out_(out), report_(report) {}
+      : bundle_(bundle), source_(source), out_(out), report_(report) {}
 
   Status copy(const TensorInfo& tensor) {
     return out_.copy(bundle_, tensor, [this](std::size_t size) { tell(size); });
@@ -88,7 +88,7 @@ class Writer {
     const std::size_t row = tensor.data.size() / static_cast<std::size_t>(d_out);
     std::vector<float> scales(static_cast<std::size_t>(d_out));
     std::vector<float> widened(static_cast<std::size_t>(kPartRows * d_in));
-    VLA_TRY(CodeMaker maker, CodeMaker::open(bundle_, tensor, wanted, int4_));
+    VLA_TRY(CodeMaker maker, CodeMaker::open(bundle_, tensor, wanted, source_));
     Squares squares;
     for (std::int64_t first = 0; first < d_out; first += kPartRows) {
       const std::int64_t n = std::min(kPartRows, d_out - first);
@@ -117,7 +117,7 @@ class Writer {
   }
 
   const Bundle& bundle_;
-  const Int4Codes& int4_;
+  const CodeSource& source_;
   BundleFile& out_;
   const std::function<void(QuantizeProgress)>& report_;
   ReadBuffer buffer_;
@@ -220,7 +220,7 @@ Result<std::vector<Quantizable>> quantizable(const std::string& path) {
 Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, const Choice& choice,
                                               const std::string& why,
                                               const std::function<void(QuantizeProgress)>& progress,
-                                              const Int4Codes& int4) {
+                                              const CodeSource& source) {
   VLA_TRY(const Bundle bundle, Bundle::open(from));
   VLA_TRY(const Matrices matrices, find_matrices(bundle, choice));
   const std::vector<TensorInfo> tensors = quantized_tensors(bundle, matrices);
@@ -229,7 +229,7 @@ Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std
   Status made;
   const Status written = write_file(to, [&](int file) {
     BundleFile out(file, quantized_keys(bundle, matrices, why), tensors);
-    Writer writer(bundle, int4, out, progress);
+    Writer writer(bundle, source, out, progress);
     made = write_tensors(bundle, matrices, writer, report);
     return made && out.seal();
   });

@@ -42,12 +42,12 @@ class Search {
  public:
   using Report = std::function<void(int, const Moved&)>;
   Search(std::string from, std::string trial, std::span<const Judged> judged, const EngineOptions& options,
-         const Int4Codes& int4, const Report& report)
+         const CodeSource& source, const Report& report)
       : from_(std::move(from)),
         trial_(std::move(trial)),
         judged_(judged),
         options_(options),
-        int4_(int4),
+        source_(source),
         report_(report) {}
 
   Status open() {
@@ -111,7 +111,7 @@ class Search {
     const bool is_stored = std::ranges::all_of(blocks, [](const Block& b) { return b.codes == Rounding::none; });
     if (!is_stored)
       if (const auto made = quantize(
-              from_, trial_, choice_of(blocks), {}, [](QuantizeProgress) {}, int4_);
+              from_, trial_, choice_of(blocks), {}, [](QuantizeProgress) {}, source_);
           !made)
         return made.error();
     VLA_TRY(const auto got, chunks_of(is_stored ? from_ : trial_, options_, judged_));
@@ -191,7 +191,7 @@ class Search {
   const std::string from_, trial_;
   const std::span<const Judged> judged_;
   const EngineOptions& options_;
-  const Int4Codes& int4_;
+  const CodeSource& source_;
   const Report& report_;
   std::int64_t n_byte_ = 0;  // bytes of the unquantized file
   bool knows_int8_ = false;
@@ -236,9 +236,9 @@ Choice choice_of(const std::vector<Block>& blocks) {
 }
 
 Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,
-                     const Bound& bound, const EngineOptions& options, const Int4Codes& int4,
+                     const Bound& bound, const EngineOptions& options, const CodeSource& source,
                      const std::function<void(int, const Moved&)>& report) {
-  Search search(from, trial, judged, options, int4, report);
+  Search search(from, trial, judged, options, source, report);
   VLA_CHECK(search.open());
   const Status done = bound.error ? search.to_error(*bound.error) : search.to_size(*bound.bytes);
   std::error_code ignored;

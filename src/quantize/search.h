@@ -53,10 +53,10 @@ struct Found {
 /// Chooses int4, int8 or the stored floats for every block: the fewest bytes within the error bound, or the least error
 /// within the bytes. It measures each block as int4 alone, assumes that the errors of blocks add in squares, then
 /// measures the whole choice and adjusts it until the bound holds. `trial`: a temporary file, which is removed.
-/// `options`: of the engines; `int4`: as in `quantize`. Errors: those of `quantize` and of Engine; unsupported if the
+/// `options`: of the engines; `source`: as in `quantize`. Errors: those of `quantize` and of Engine; unsupported if the
 /// bound cannot hold, with what can.
 Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,
-                     const Bound& bound, const EngineOptions& options, const Int4Codes& int4,
+                     const Bound& bound, const EngineOptions& options, const CodeSource& source,
                      const std::function<void(int trial, const Moved&)>& report);
 
 /// The choice that a search found, by tensor.

@@ -190,8 +190,7 @@ Result<Smoothing> find_smoothing(const std::string& bundle, std::span<const Judg
                                 .see_graph = [&](const Graph& graph) { finder.see(graph); }}));
   const std::vector<SmoothingPlace> places = finder.found();
   if (places.empty())
-    return Error{Code::unsupported, bundle, "norms or gated MLPs whose channels may be divided", "none",
-                 "leave out --calibrate"};
+    return Error{Code::unsupported, bundle, "norms or gated MLPs whose channels may be divided", "none"};
   Smoothing found = {.n_place = static_cast<int>(places.size())};
   VLA_TRY(const Ranges ranges, measure_ranges(bundle, places, observations, options, found.chunks));
   VLA_TRY(const Bundle file, Bundle::open(bundle));

@@ -6,7 +6,9 @@
 
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <cmath>
+#include <limits>
 #include <random>
 
 #include "kernels/quantize_weights.h"
@@ -67,34 +69,81 @@ TEST_CASE("of many rows some are taken, and columns that are far apart have noth
   for (std::size_t i = 0; i < a.size(); i += 101) CHECK(a[i] == doctest::Approx(b[i]).epsilon(1e-3));
 }
 
-TEST_CASE("products of int4 codes miss a fraction with feedback") {
-  constexpr std::size_t kWidth = 192, kRows = 32, kSamples = 400;
-  const std::vector<float> weights = normals(kRows * kWidth, 4), x = mixed(kSamples, kWidth, 24);
-  Hessian hessian(kWidth);
-  for (std::size_t r = 0; r < kSamples; r += 100)  // as taps come: some rows at a time
-    hessian.add(std::span(x).subspan(r * kWidth, 100 * kWidth));
-  const std::vector<float> feedback = std::move(hessian).feedback();
-  std::vector<Int4Block> blocks(kRows * kWidth / 64);
-  std::vector<float> scales(kRows), room(kRows * kWidth);
-  const auto missed = [&] {
+/// Products of weights and x, and how far codes of the weights miss them.
+class Products {
+ public:
+  static constexpr std::int64_t kWidth = 192, kRows = 32;
+
+  std::vector<float> feedback() const {
+    Hessian hessian(kWidth);
+    for (std::size_t r = 0; r < kSamples; r += 100)  // as taps come: some rows at a time
+      hessian.add(std::span(x_).subspan(r * kWidth, 100 * kWidth));
+    return std::move(hessian).feedback();
+  }
+  /// code: of an element of a row.
+  template <class F>
+  double missed(F code) const {
     double sum = 0;
-    for (std::size_t r = 0; r < kRows; ++r)
+    for (std::int64_t r = 0; r < kRows; ++r)
       for (std::size_t s = 0; s < kSamples; ++s) {
         double error = 0;
-        for (std::size_t k = 0; k < kWidth; ++k) {
-          const int code = blocks[(r * kWidth + k) / 64][static_cast<std::int64_t>(k % 64)];
-          error += (weights[r * kWidth + k] - static_cast<float>(code) * scales[r]) * x[s * kWidth + k];
-        }
+        for (std::int64_t k = 0; k < kWidth; ++k)
+          error +=
+              (weights[at(r * kWidth + k)] - static_cast<float>(code(r, k)) * scales[at(r)]) * x_[s * kWidth + at(k)];
         sum += error * error;
       }
     return std::sqrt(sum);
+  }
+  /// Rounds without feedback, then with it. Returns the share of errors that is left. codes: of all rows.
+  template <class Codes, class F>
+  double left(Codes* codes, F code) {
+    const auto* const stored = reinterpret_cast<const std::byte*>(weights.data());
+    const std::vector<float> compensation = feedback();
+    std::vector<float> room(weights.size());
+    kernels::quantize_weights(DType::f32, stored, kWidth, kRows, codes, scales.data(), room.data());
+    const double without = missed(code);
+    kernels::quantize_weights(DType::f32, stored, kWidth, kRows, compensation.data(), codes, scales.data(),
+                              room.data());
+    return missed(code) / without;
+  }
+
+  std::vector<float> weights = normals(kRows * kWidth, 4), scales = std::vector<float>(kRows);
+
+ private:
+  static constexpr std::size_t kSamples = 400;
+  static std::size_t at(std::int64_t i) { return static_cast<std::size_t>(i); }
+  std::vector<float> x_ = mixed(kSamples, kWidth, 24);
+};
+
+TEST_CASE("products of int4 codes miss a fraction with feedback") {
+  Products products;
+  std::vector<Int4Block> blocks(Products::kRows * Products::kWidth / 64);
+  CHECK(products.left(blocks.data(), [&](std::int64_t r, std::int64_t k) {
+    return blocks[static_cast<std::size_t>((r * Products::kWidth + k) / 64)][k % 64];
+  }) < 0.3);
+}
+
+TEST_CASE("products of int8 codes miss a fraction with feedback") {
+  Products products;
+  std::vector<std::byte> codes(Products::kRows * Products::kWidth);
+  const auto code = [&](std::int64_t r, std::int64_t k) {
+    return static_cast<int>(static_cast<signed char>(codes[static_cast<std::size_t>(r * Products::kWidth + k)]));
   };
-  const auto* const stored = reinterpret_cast<const std::byte*>(weights.data());
-  kernels::quantize_weights(DType::f32, stored, kWidth, kRows, blocks.data(), scales.data(), room.data());
-  const double without = missed();
-  kernels::quantize_weights(DType::f32, stored, kWidth, kRows, feedback.data(), blocks.data(), scales.data(),
-                            room.data());
-  CHECK(missed() < 0.3 * without);
+  CHECK(products.left(codes.data(), code) < 0.3);
+  CHECK(products.missed(code) > 0);
+}
+
+TEST_CASE("with feedback, int8 has scales of the largest magnitudes, and NaN for a row that is not finite") {
+  Products products;
+  products.weights[5] = 1000;  // its error is nothing; what is added to others cannot exceed the largest code
+  products.weights[Products::kWidth] = std::numeric_limits<float>::infinity();
+  std::vector<std::byte> codes(Products::kRows * Products::kWidth);
+  products.left(codes.data(), [](std::int64_t, std::int64_t) { return 0; });
+  CHECK(products.scales[0] == 1000.0f / 127);
+  CHECK(codes[5] == std::byte{127});
+  CHECK(std::isnan(products.scales[1]));
+  CHECK(std::all_of(codes.begin() + Products::kWidth, codes.begin() + 2 * Products::kWidth,
+                    [](std::byte code) { return code == std::byte{0}; }));
 }
 
 TEST_CASE("most float matrices of golden cases have Hessians") {
