@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far codes move the chunks of observations that they were not calibrated with.
 
-    python tools/quantize_held_out.py [NAME ...] [--every 23] [--factors 24,50] [--vla build/cpu/bin/vla ...]
+    python tools/quantize_held_out.py [NAME ...] [--packages DIR] [--dtypes int8 int4] [--every 23] [--factors 24,50] [--vla build/cpu/bin/vla ...]
 
-NAME is metaworld (the shipped policy on its recorded episodes) or a golden case of random weights, widened to matrices that become
-codes (tests/cli/quantize_families_test.py); all by default.  Each is judged as it is, and with planted channels: in every norm that
+NAME is metaworld (the shipped policy on its recorded episodes), a golden case of random weights, widened to matrices that become
+codes (tests/cli/quantize_families_test.py), or, with --packages, one with a trained language model (tools/trained_parts.py); the first two by default.  Each is judged as it is, and with planted channels: in every norm that
 only matrices read, also where it is computed at load, and in every gated MLP, channels are larger by the factors, and the columns of the matrices
 smaller.  Where powers of two do not leave the float32 chunk the same to the bit, something else reads the norm; it is left as it was.
 
@@ -17,6 +17,7 @@ The runtime that acts is the engine in this process (VLA_LIBRARY).
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -46,11 +47,8 @@ def shipped():
 
 
 def random_policy(name, folder):
-    """A widened golden case, and random frames and states for it."""
-    from golden_cases import Golden
+    """A widened golden case."""
     from goldens import all_cases, cases
-    from goldens.draw import Generator
-    from PIL import Image
     from quantize_families_test import WIDE
 
     case = all_cases()[name]
@@ -58,6 +56,30 @@ def random_policy(name, folder):
     cases.write_checkpoint(case, folder)
     cases.write_observation(case, folder)
     cases.write_bundle(folder)
+    return folder / "bundle.gguf", random_observations(folder)
+
+
+def trained_policy(name, folder, packages, program):
+    """A policy with a trained language model, and with a far channel in its vision tower."""
+    import trained_parts
+
+    from vla_cpp.convert.bundle import read_bundle
+
+    trained_parts.write_random(name, folder)
+    bundle, content = folder / "bundle.gguf", read_bundle(str(folder / "bundle.gguf"))
+    last = max(int(tensor.split(".")[2]) for tensor in content.tensors if tensor.startswith("vision.blk."))
+    tokens = next(iter(blocks_of(program, folder, bundle, f"vision.blk.{last}").values()))
+    changed = trained_parts.trained_tensors(name, packages, content) | trained_parts.with_far_channel(content, tokens.reshape(-1, tokens.shape[-1]))
+    return write_like(bundle, content, folder / "trained.gguf", changed), random_observations(folder)
+
+
+def random_observations(folder):
+    """Frames and states for a case."""
+    from golden_cases import Golden
+    from goldens import cases
+    from goldens.draw import Generator
+    from PIL import Image
+
     golden, generator, observations = Golden(str(folder)), Generator(54), []
 
     def drawn(numbers):
@@ -70,7 +92,46 @@ def random_policy(name, folder):
             images[view] = cases.smooth_frame(height, width, generator) if file else None
         state = {k: drawn(v) for k, v in golden.state.items()} if isinstance(golden.state, dict) else drawn(golden.state)
         observations.append(dict(images=images, state=state, text=golden.text, seed=seed))
-    return golden.bundle, observations
+    return observations
+
+
+def blocks_of(program, folder, bundle, pattern="*", kernels="float32"):
+    """What the prefix's blocks return for the case's own observation."""
+    from golden_cases import Golden, tensors
+
+    arguments = Golden(str(folder)).arguments(bundle, options=("--tap", pattern, "--taps-out", folder / "taps.gguf", *(("--kernels", kernels) if kernels else ())))
+    answer = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
+    assert answer.returncode == 0, answer.stderr
+    return {path: values for path, values in tensors(folder / "taps.gguf").items() if re.fullmatch(r"(?!step\.).*\.blk\.\d+", path)}
+
+
+def print_blocks(program, folder, bundle, made):
+    """Percent by which the last block of each module is moved, and the one that is moved most."""
+    expected, got = blocks_of(program, folder, bundle), blocks_of(program, folder, made, kernels=None)
+    error = {path: 100 * np.sqrt(np.mean((got[path] - x) ** 2) / np.mean(x**2)) for path, x in expected.items()}
+    last = {path.rsplit(".", 1)[0]: path for path in sorted(error, key=lambda path: int(path.rsplit(".", 1)[1]))}
+    worst = max(error, key=error.get)
+    print("      " + ", ".join(f"{path} {error[path]:.2f} %" for path in (*last.values(), worst)), flush=True)
+
+
+def write_like(bundle, content, path, changed):
+    """A bundle with other values of some tensors, in its dtypes.  changed: {tensor: float32}."""
+    from bundle_keys import bundle_keys
+
+    from vla_cpp.convert.bundle import BundleWriter, TensorInfo
+
+    def stored(name, values):
+        floats = np.ascontiguousarray(changed[name], np.float32) if name in changed else values
+        if name not in changed or content.dtypes[name] == "f32":
+            return floats
+        bits = floats.view(np.uint32).astype(np.uint64)
+        return ((bits + 0x7FFF + (bits >> 16 & 1)) >> 16).astype(np.uint16)
+
+    tensors = [TensorInfo(name, values.shape, content.dtypes[name]) for name, values in content.tensors.items()]
+    with BundleWriter(str(path), bundle_keys(bundle), tensors) as out:
+        for name, values in content.tensors.items():
+            out.write(name, stored(name, values))
+    return path
 
 
 def chunks(bundle, observations, kernels=None):
@@ -111,29 +172,21 @@ class Planter:
         return 0 if values is None or self.content.dtypes[matrix] not in ("bf16", "f32") else values.shape[1]
 
     def write(self, path, places, factors):
-        from bundle_keys import bundle_keys
-
-        from vla_cpp.convert.bundle import BundleWriter, TensorInfo
-
-        dtypes = self.content.dtypes
+        dtypes, values = self.content.dtypes, self.content.tensors
         by_rows, by_columns = defaultdict(lambda: 1), defaultdict(lambda: 1)
         for place in places:
             makers, readers = self.places[place]
-            by = np.ones(len(self.content.tensors[makers[0]]), np.float32)
+            by = np.ones(len(values[makers[0]]), np.float32)
             by[:: self.every] = np.resize(np.array(factors, np.float32), len(by[:: self.every]))
             for maker in makers:
-                by_rows[maker] = by_rows[maker] * (by[:, None] if self.content.tensors[maker].ndim == 2 else by)
+                by_rows[maker] = by_rows[maker] * (by[:, None] if values[maker].ndim == 2 else by)
             for reader in readers:
                 by_columns[reader] = by_columns[reader] / by
-        tensors = [TensorInfo(name, values.shape, dtypes[name]) for name, values in self.content.tensors.items()]
-        with BundleWriter(str(path), bundle_keys(self.bundle), tensors) as out:
-            for name, values in self.content.tensors.items():
-                if name in by_rows or name in by_columns:
-                    floats = (values.astype(np.uint32) << 16).view(np.float32) if dtypes[name] == "bf16" else values
-                    floats = (floats * by_rows[name] * by_columns[name]).astype(np.float32)
-                    values = (floats.view(np.uint32) >> 16).astype(np.uint16) if dtypes[name] == "bf16" else floats
-                out.write(name, values)
-        return path
+        changed = {}
+        for name in {*by_rows, *by_columns}:
+            floats = (values[name].astype(np.uint32) << 16).view(np.float32) if dtypes[name] == "bf16" else values[name]
+            changed[name] = (floats * by_rows[name] * by_columns[name]).astype(np.float32)
+        return write_like(self.bundle, self.content, path, changed)
 
     def find(self, path, observation):
         """The places where only matrices read.  `path`: of a bundle that may be written."""
@@ -153,8 +206,9 @@ class Planter:
 
 
 def record(bundle, folder, observations):
-    import vla_cpp
     from server_process import SECONDS, Server
+
+    import vla_cpp
 
     server = Server(SimpleNamespace(bundle=bundle), "--record", folder)
     with vla_cpp.Client(server.address, timeout=SECONDS) as robot:
@@ -164,7 +218,7 @@ def record(bundle, folder, observations):
     return folder
 
 
-def judge(bundle, work, recording, observations, expected, programs):
+def judge(bundle, work, recording, observations, expected, programs, dtypes, has_blocks):
     """Percent of all observations and of the median one, for each dtype and column."""
 
     def moved(made, kernels=None):
@@ -178,11 +232,17 @@ def judge(bundle, work, recording, observations, expected, programs):
         print("".join(f"      {line}\n" for line in answer.stdout.splitlines() if " over " in line), end="", flush=True)
         return work / "codes.gguf"
 
-    for dtype in ("int8", "int4"):
+    if has_blocks:
+        yield "bf16", [moved(bundle, "bf16")]
+    for dtype in dtypes:
         row = [moved(quantized(programs[0], "--dtype", dtype))]
+        if has_blocks:
+            print_blocks(programs[0], work, bundle, work / "codes.gguf")
         for program in programs:
             made = quantized(program, "--dtype", dtype, "--calibrate", recording)
             row += [moved(made), moved(made, "float32")]
+            if has_blocks:
+                print_blocks(program, work, bundle, made)
         yield dtype, row
 
 
@@ -191,21 +251,27 @@ def main():
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("names", nargs="*", default=["metaworld", *WIDE], metavar="NAME")
+    parser.add_argument("--packages", help="folder of the packages that tools/trained_parts.py names")
     parser.add_argument("--every", type=int, default=23, help="distance of planted channels")
     parser.add_argument("--factors", default="24,50")
+    parser.add_argument("--dtypes", nargs="+", default=["int8", "int4"])
     parser.add_argument("--vla", nargs="+", default=[os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla")], help="programs to compare")
     options = parser.parse_args()
     factors = [float(factor) for factor in options.factors.split(",")]
     for name in options.names:
         with tempfile.TemporaryDirectory() as folder:
             work = Path(folder)
-            bundle, observations = shipped() if name == "metaworld" else random_policy(name, work / name)
+            is_trained = name in ("smolvla/smollm2", "turbovla/minilm")
+            if is_trained:
+                bundle, observations = trained_policy(name, work, options.packages, options.vla[0])
+            else:
+                bundle, observations = shipped() if name == "metaworld" else random_policy(name, work)
             seen, held = observations[::2], observations[1::2]
             recording, planter = record(bundle, work / "recording", seen), Planter(bundle, options.every)
             places = planter.find(work / "planted.gguf", held[0])
             planter.write(work / "planted.gguf", places, factors)
             for what, one in (("as it is", bundle), (f"{len(places)} of {len(planter.places)} planted", work / "planted.gguf")):
-                for dtype, row in judge(one, work, recording, held, chunks(one, held, "float32"), options.vla):
+                for dtype, row in judge(one, work, recording, held, chunks(one, held, "float32"), options.vla, options.dtypes, is_trained):
                     print(f"{name:<20} {what:<20} {dtype}  " + "  ".join(f"{error:6.2f} ({median:5.2f})" for error, median in row), flush=True)
 
 
