@@ -16,7 +16,7 @@ constexpr std::int64_t kRows = 32;         // kept of a value
 constexpr std::int64_t kMatrixRows = 128;  // of a matrix that are multiplied with them
 
 /// Bytes of rows in memory at a time.
-std::size_t most_bytes(std::size_t budget) {
+std::size_t most_sample_bytes(std::size_t budget) {
   constexpr std::size_t kMost = std::size_t{256} << 20;
   return budget > 0 ? std::min(kMost, budget / 8) : kMost;
 }
@@ -160,7 +160,7 @@ Result<Samples> take_samples(const std::string& bundle, std::span<const Scaling>
   options.kernels = "float32";
   for (const Scaling& scaling : scalings) {
     size += scaling.by.size() * kRows * sizeof(float);
-    if (!samples.empty() && size > most_bytes(options.memory)) break;
+    if (!samples.empty() && size > most_sample_bytes(options.memory)) break;
     samples.try_emplace(scaling.path, scaling.by.size());
     options.tap_pattern += fmt::format("{0},step.*.{0},", scaling.path);
   }

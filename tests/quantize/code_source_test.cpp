@@ -14,12 +14,12 @@ using namespace vla::test;
 namespace {
 
 /// The shipped policy has matrices that are large enough for codes.
-const std::string kShipped = VLA_SOURCE_DIR "/models/metaworld-tiny.gguf";
+const std::string kPolicy = VLA_SOURCE_DIR "/models/metaworld-tiny.gguf";
 
 Bundle quantized(const char* to, const Choice& choice, const CodeSource& source) {
   const std::string path = write_file(to, "");
   REQUIRE(quantize(
-              kShipped, path, choice, "", [](QuantizeProgress) {}, source)
+              kPolicy, path, choice, "", [](QuantizeProgress) {}, source)
               .ok());
   Result<Bundle> bundle = Bundle::open(path);
   REQUIRE(bundle.ok());
