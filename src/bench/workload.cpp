@@ -83,15 +83,16 @@ Result<Workload> Workload::make(const Processor& processor, const WorkloadSizes&
                  fmt::format("{} to {}, which the bundle allows", processor.min_views(), views.size()),
                  std::to_string(n_view)};
   const Recipe& recipe = processor.recipe();
-  const CameraSize camera = recipe.fit->camera_size().value_or(CameraSize{recipe.width, recipe.height});
-  workload.width_ = sizes.width > 0 ? sizes.width : camera.width;
-  workload.height_ = sizes.height > 0 ? sizes.height : camera.height;
   for (int i = 0; i < static_cast<int>(views.size()); ++i) {
     const std::string& view = views[static_cast<std::size_t>(i)];
     workload.observation_.views[view] = std::nullopt;
     if (i >= n_view) continue;
-    const auto rgb = draw_frame(workload.width_, workload.height_, static_cast<std::uint32_t>(i));
-    VLA_TRY(std::vector<std::byte> png, write_png(rgb, workload.width_, workload.height_));
+    const CameraSize camera = recipe.fit->camera_size(i).value_or(CameraSize{recipe.width, recipe.height});
+    const int width = sizes.width > 0 ? sizes.width : camera.width;
+    const int height = sizes.height > 0 ? sizes.height : camera.height;
+    if (i == 0) workload.width_ = width, workload.height_ = height;
+    const auto rgb = draw_frame(width, height, static_cast<std::uint32_t>(i));
+    VLA_TRY(std::vector<std::byte> png, write_png(rgb, width, height));
     workload.frames_.push_back({view, std::move(png)});
   }
   const std::vector<std::string>& states = processor.states().names();

@@ -199,6 +199,8 @@ std::vector<int> Scope::integers(const std::string& key, Range range) const {
   return take(list_->keys().integers(key_of(key), range), std::vector<int>());
 }
 
+bool Scope::has(const std::string& key) const { return list_->keys().has(key_of(key)); }
+
 int Scope::index(const std::string& key, int count) const {
   return take(list_->keys().integer(key_of(key), {0, count - 1.0}), 0);
 }

@@ -104,6 +104,7 @@ class Scope {
   std::string string(const std::string& key) const;
   std::vector<std::string> strings(const std::string& key) const;
   std::vector<int> integers(const std::string& key, Range range) const;
+  bool has(const std::string& key) const;
   /// An index from 0 to count - 1.
   int index(const std::string& key, int count) const;
   /// The index of the key's word among `words`.

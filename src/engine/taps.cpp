@@ -2,9 +2,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "engine/taps.h"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <map>
 #include <string_view>
 
 #include "base/file.h"
@@ -62,8 +65,12 @@ Status write_taps(const std::vector<Tap>& taps, const std::string& file) {
   Keys keys;
   keys.set("general.architecture", Value(std::string("vla-taps")));
   std::vector<TensorInfo> tensors;
-  for (const Tap& tap : taps)
-    tensors.push_back({tap.path, DType::f32, tap.shape, std::as_bytes(std::span(tap.values))});
+  std::map<std::string, int> times;  // a module that runs once for each size of frames has its path more than once
+  for (const Tap& tap : taps) {
+    const int time = ++times[tap.path];
+    tensors.push_back({time > 1 ? fmt::format("{}.{}", tap.path, time) : tap.path, DType::f32, tap.shape,
+                       std::as_bytes(std::span(tap.values))});
+  }
   return write_file(file, write_gguf(keys, tensors));
 }
 

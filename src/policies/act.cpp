@@ -5,6 +5,8 @@
 // Training's style variable is zero at inference, so its encoder is not part of the policy. Reference: lerobot
 // src/lerobot/policies/act/modeling_act.py
 
+#include <fmt/format.h>
+
 #include "modules/detr.h"
 #include "modules/vision/resnet.h"
 #include "nn/embedding.h"
@@ -15,11 +17,34 @@
 namespace vla {
 namespace {
 
+/// Consecutive views whose frames have one size.
+struct ViewRun {
+  int width, height, first, count;
+};
+
+/// `view_sizes`: width and height of each view's frames, in the upper left corner of images of one size; without the
+/// key frames are as large as images.
+std::vector<ViewRun> read_runs(const Scope& s) {
+  std::vector<ViewRun> runs;
+  if (!s.has("view_sizes")) return runs;
+  const std::vector<int> sides = s.integers("view_sizes", {1, 16384});
+  s.require(!sides.empty() && sides.size() % 2 == 0, "view_sizes", "two sides of each view",
+            std::to_string(sides.size()) + " numbers");
+  for (std::size_t i = 0; i + 1 < sides.size(); i += 2) {
+    const int width = sides[i], height = sides[i + 1];
+    if (runs.empty() || runs.back().width != width || runs.back().height != height)
+      runs.push_back({width, height, static_cast<int>(i / 2), 0});
+    ++runs.back().count;
+  }
+  return runs;
+}
+
 class Act final : public Policy {
   int d_state_, d_environment_, horizon_;
   int n_token_;  // tokens before those of the views: style, robot, environment
   DetrFamily family_;
-  ResNet vision_;  // observation rate
+  ResNet vision_;              // observation rate
+  std::vector<ViewRun> runs_;  // none: all views have the images' size
   Linear projector_;
   Embedding position_;
   const Param* style_;
@@ -42,6 +67,7 @@ class Act final : public Policy {
         n_token_(d_environment_ > 0 ? 3 : 2),
         family_(DetrFamily::read(s / "transformer")),
         vision_(s / "vision"),
+        runs_(read_runs(s / "vision")),
         projector_(s / "projector", vision_.d_model(), family_.d_model, Bias::yes),
         position_(s / "position", family_.d_model, n_token_),
         style_((s / "style").vector("weight", family_.d_model)),
@@ -64,7 +90,19 @@ class Act final : public Policy {
     VLA_CHECK(vision_.check(shape.width, shape.height));
     if (shape.n_text > 0)
       return Error{Code::bad_bundle, "processor.recipe.text", "none, since the network reads no text", "tokenize"};
-    return check_prefix(shape.n_view, ResNet::n_cell(shape.width) * ResNet::n_cell(shape.height), n_token_);
+    if (runs_.empty())
+      return check_prefix(shape.n_view, ResNet::n_cell(shape.width) * ResNet::n_cell(shape.height), n_token_);
+    int n_cell = 0;
+    for (const ViewRun& run : runs_) {
+      if (run.width > shape.width || run.height > shape.height)
+        return Error{Code::bad_bundle, "vision.view_sizes", fmt::format("at most {} x {}", shape.width, shape.height),
+                     fmt::format("{} x {}", run.width, run.height)};
+      n_cell += run.count * ResNet::n_cell(run.width) * ResNet::n_cell(run.height);
+    }
+    if (runs_.back().first + runs_.back().count != shape.n_view)
+      return Error{Code::bad_bundle, "vision.view_sizes", fmt::format("sizes of {} views", shape.n_view),
+                   std::to_string(runs_.back().first + runs_.back().count)};
+    return check_prefix(1, n_cell, n_token_);
   }
 
   /// Queries start at zero, so the first layer's self-attention is the same for every observation.
@@ -74,14 +112,18 @@ class Act final : public Policy {
   }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
-    const Tensor map = vision_(g, in.images);  // [512, n_column, n_row, n_view]
-    const Tensor image = projector_(g, map);
+    std::vector<Tensor> places = {position_.forward(g, arange(g, n_token_))}, views;
+    for (const Tensor& images : of_one_size(g, in.images)) {
+      const Tensor map = vision_(g, images);  // [512, n_column, n_row, n_view]
+      views.push_back(cells(g, projector_(g, map)));
+      place(g, map, places);
+    }
     g.end_stage("vision");
     std::vector<Tensor> tokens = {g.parameter(style_), state_in_(g, slice(g, in.state, 0, 0, d_state_))};
     if (environment_in_) tokens.push_back((*environment_in_)(g, slice(g, in.state, 0, d_state_, d_environment_)));
-    tokens.push_back(cells(g, image));
+    tokens.insert(tokens.end(), views.begin(), views.end());
     Tensor x = g.name("prefix", concat_tokens(g, tokens));
-    const Tensor position = positions(g, map);
+    const Tensor position = concat_tokens(g, places);
     for (const DetrEncoderLayer& layer : encoder_) x = layer(g, x, position);
     if (encoder_norm_) x = (*encoder_norm_)(g, x);
     for (const DetrDecoderLayer& layer : decoder_) put(g, cache, layer.path(), layer.project(g, x, position));
@@ -102,13 +144,21 @@ class Act final : public Policy {
   static Tensor cells(Graph& g, Tensor map) {
     return g.add(op::Reshape{}, {map}, {map.dim(0), map.dim(1) * map.dim(2) * map.dim(3), 1, 1});
   }
-  /// The positions of all encoder tokens. Views have the same positions.
-  Tensor positions(Graph& g, Tensor map) const {
+  /// The frames of each run: images [width, height, 3, n_view] -> [width, height, 3, count] of the run's size.
+  std::vector<Tensor> of_one_size(Graph& g, Tensor images) const {
+    if (runs_.empty()) return {images};
+    std::vector<Tensor> parts;
+    for (const ViewRun& run : runs_) {
+      const Tensor views = slice(g, images, 3, run.first, run.count);
+      parts.push_back(slice(g, slice(g, views, 0, 0, run.width), 1, 0, run.height));
+    }
+    return parts;
+  }
+  /// Appends the positions of a map's cells. Views of one size have the same positions.
+  void place(Graph& g, Tensor map, std::vector<Tensor>& places) const {
     const Tensor of_cells =
         sine_positions(g, static_cast<int>(map.dim(1)), static_cast<int>(map.dim(2)), family_.d_model);
-    std::vector<Tensor> parts = {position_.forward(g, arange(g, n_token_))};
-    parts.insert(parts.end(), static_cast<std::size_t>(map.dim(3)), of_cells);
-    return concat_tokens(g, parts);
+    places.insert(places.end(), static_cast<std::size_t>(map.dim(3)), of_cells);
   }
 };
 

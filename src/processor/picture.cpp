@@ -38,7 +38,7 @@ Result<Frame> picture_of(const Processor& processor, const Frame& frame, int vie
   const std::size_t n_pixel = static_cast<std::size_t>(recipe.width) * static_cast<std::size_t>(recipe.height);
   std::vector<float> planes(kChannels * n_pixel);
   VLA_CHECK(check_frame(frame, name));
-  VLA_CHECK(recipe.fit->apply(frame, planes, name));
+  VLA_CHECK(recipe.fit->apply(frame, view, planes, name));
   apply_ops(recipe, view, planes);
   const std::array<float, 2 * kChannels> ends = ends_of(recipe, view);
   std::vector<std::uint8_t> rgb(planes.size());

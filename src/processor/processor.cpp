@@ -121,7 +121,7 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs) 
 }
 
 Status Processor::encode_view(const Frame& frame, const std::string& name, int view, std::span<float> out) const {
-  VLA_CHECK(recipe_.fit->apply(frame, out, name));
+  VLA_CHECK(recipe_.fit->apply(frame, view, out, name));
   for (const auto& op : recipe_.image)
     if (op->view() == PlaneOp::kEveryView || op->view() == view) op->apply(out);
   return {};

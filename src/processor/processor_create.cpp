@@ -97,7 +97,8 @@ Status Processor::read_features(const Bundle& bundle) {
   if (views.size() > static_cast<std::size_t>(kMaxViews))
     return misfit("observation.views", fmt::format("at most {} views", kMaxViews), std::to_string(views.size()));
   const auto is_missing = [&](const auto& op) { return op->view() >= static_cast<int>(views.size()); };
-  if (std::any_of(recipe_.image.begin(), recipe_.image.end(), is_missing))
+  if (std::any_of(recipe_.image.begin(), recipe_.image.end(), is_missing) ||
+      recipe_.fit->n_view() > static_cast<int>(views.size()))
     return misfit("processor.recipe.image", fmt::format("ops of the {} views", views.size()), "one of a later view");
   view_absent_.assign(views.size(), false);
   views_ = FeatureNames("view", std::move(views), std::move(aliases));

@@ -52,11 +52,14 @@ std::vector<float> state_of(const Robot& robot, const std::string& state, std::s
 Observation largest_observation(const Robot& robot, std::uint64_t number) {
   const Processor& processor = robot.processor();
   const Recipe& recipe = processor.recipe();
-  const auto [width, height] = recipe.fit->camera_size().value_or(CameraSize{recipe.width, recipe.height});
-  const std::vector<std::uint8_t> grey(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3, 128);
   Observation observation;
-  for (std::size_t i = 0; i < processor.views().names().size(); ++i)
-    if (!processor.is_absent(i)) observation.views.emplace(processor.views().names()[i], Frame{width, height, grey});
+  for (std::size_t i = 0; i < processor.views().names().size(); ++i) {
+    if (processor.is_absent(i)) continue;
+    const auto [width, height] =
+        recipe.fit->camera_size(static_cast<int>(i)).value_or(CameraSize{recipe.width, recipe.height});
+    std::vector<std::uint8_t> grey(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3, 128);
+    observation.views.emplace(processor.views().names()[i], Frame{width, height, std::move(grey)});
+  }
   for (std::size_t i = 0; i < processor.states().names().size(); ++i)
     observation.states.emplace(
         processor.states().names()[i],

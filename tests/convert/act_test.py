@@ -79,6 +79,30 @@ def test_cameras_with_other_statistics_have_ops_of_their_own(planned):
     assert not any(name.startswith("stats.observation.images") for name in made.statistics)
 
 
+def test_frames_of_each_camera_keep_their_size(planned):
+    keys, _ = planned(path="input_features/observation.images.top/shape", value=[3, 20, 48])
+    ops = json.loads(keys["processor.recipe"])["image"]
+    assert ops[:4] == [
+        {"op": "camera_size", "view": 0, "width": 48, "height": 20},
+        {"op": "camera_size", "view": 1, "width": 40, "height": 33},
+        {"op": "canvas", "width": 48, "height": 33},
+        {"op": "size", "width": 48, "height": 33},
+    ]
+    assert (keys["vision.image_width"], keys["vision.image_height"], keys["vision.view_sizes"]) == (48, 33, [48, 20, 40, 33])
+
+
+def test_an_absent_mapping_is_that_of_the_class():
+    checkpoint = of_config({key: value for key, value in SMALL.config.items() if key != "normalization_mapping"})
+    sizes_of(read_sizes, checkpoint)
+    assert checkpoint.config["normalization_mapping"]["VISUAL"] == "MEAN_STD"  # as the older layout's migration reads it
+
+
+def test_more_cameras_than_the_runtime_has_are_refused(refusal):
+    camera = {"type": "VISUAL", "shape": [3, 33, 40]}
+    features = SMALL.config["input_features"] | {f"observation.images.extra{i}": camera for i in range(31)}
+    assert "input_features: expected at most 32 cameras, found 33" in refusal(path="input_features", value=features)
+
+
 def test_cameras_with_the_same_statistics_share_an_op():
     problems, norm = Problems("test"), Normalization("mean_std", 1e-8, ONES)
     assert standardized([("a", norm), ("b", norm)], problems) == [
@@ -106,7 +130,6 @@ def test_cameras_with_the_same_statistics_share_an_op():
         ("n_obs_steps", 2, "n_obs_steps: expected 1"),
         ("chunk_size", 2, "n_action_steps: expected at most chunk_size 2"),
         ("soft_prompt", 1, "soft_prompt: expected a key of ACTConfig"),
-        ("input_features/observation.images.top/shape", [3, 20, 40], "expected cameras of one size, found 40 x 20, 40 x 33"),
         ("input_features/observation.velocity", {"type": "STATE", "shape": [2]}, "input_features.observation.velocity: expected cameras"),
         ("input_features", {"observation.images.top": {"type": "VISUAL", "shape": [3, 33, 40]}}, "input_features.observation.state: expected type STATE"),
         ("input_features", {"observation.state": {"type": "STATE", "shape": [2]}}, "expected a VISUAL feature or several"),

@@ -11,6 +11,17 @@
 
 using namespace vla;
 
+TEST_CASE("taps of one path are told apart in a file") {
+  const auto file = std::filesystem::temp_directory_path() / fmt::format("vla-taps-path-test-{}.gguf", ::getpid());
+  REQUIRE(write_taps({{"vision.stem", {1}, {1.0f}}, {"vision.stem", {2}, {2.0f, 3.0f}}}, file).ok());
+  const auto back = read_taps(file);
+  std::filesystem::remove(file);
+  REQUIRE(back.ok());
+  REQUIRE(back->size() == 2);
+  CHECK((back->at(0).path == "vision.stem" && back->at(1).path == "vision.stem.2"));
+  CHECK(back->at(1).values == std::vector<float>{2.0f, 3.0f});
+}
+
 TEST_CASE("a pattern matches whole paths; * stands for any characters, commas separate patterns") {
   CHECK(match_path("lm.blk.3", "lm.blk.3"));
   CHECK_FALSE(match_path("lm.blk.3", "lm.blk.30"));

@@ -104,7 +104,7 @@ TEST_CASE("a JPEG on the way has the pixels of TensorFlow's encoder and decoder"
     // As an op it works on images of any size.
     const Pipeline pipeline{width, height, {JpegRoundTrip{95}}};
     std::vector<float> planes(found.size()), wanted(found.size());
-    REQUIRE(run_pipeline(frame, pipeline, planes, "view").ok());
+    REQUIRE(run_pipeline(frame, 0, pipeline, planes, "view").ok());
     spread_bytes(found, wanted);
     CHECK(planes == wanted);
     CHECK(pipeline_work(pipeline, width, height) == 2 * width * height);

@@ -226,15 +226,17 @@ TEST_CASE("ops on images end in size, and rows come first") {
 TEST_CASE("a pipeline keeps the aspect, refuses another and takes bytes only") {
   std::vector<float> out(12);
   const Frame wide{4, 2, std::vector<std::uint8_t>(24, 255)};
-  CHECK(run_pipeline(wide, {2, 2, {SquarePad{}, SmallestSide{2}}}, out, "top").ok());
+  CHECK(run_pipeline(wide, 0, {2, 2, {SquarePad{}, SmallestSide{2}}}, out, "top").ok());
   CHECK(out == std::vector<float>(12, 128.0f / 255.0f));
-  const std::string message = refusal(run_pipeline(wide, {2, 2, {SmallestSide{2}}}, out, "top"), Code::bad_observation);
+  const std::string message =
+      refusal(run_pipeline(wide, 0, {2, 2, {SmallestSide{2}}}, out, "top"), Code::bad_observation);
   CHECK(contains(message, "top: expected an image with the aspect of 2 x 2, found 4 x 2, which becomes 4 x 2"));
   const Frame sliver{1, 60000, std::vector<std::uint8_t>(180000)};
   CHECK(contains(
-      refusal(run_pipeline(sliver, {2, 2, {SquarePad{}, SmallestSide{2}}}, out, "top"), Code::bad_observation), "top"));
+      refusal(run_pipeline(sliver, 0, {2, 2, {SquarePad{}, SmallestSide{2}}}, out, "top"), Code::bad_observation),
+      "top"));
   const Frame floats{2, 2, std::vector<float>(12)};
-  CHECK(contains(refusal(run_pipeline(floats, {2, 2, {}}, out, "top"), Code::bad_observation), "8 bits"));
+  CHECK(contains(refusal(run_pipeline(floats, 0, {2, 2, {}}, out, "top"), Code::bad_observation), "8 bits"));
 }
 
 TEST_CASE("a chunk has the rows that the recipe keeps, and a clip hides nothing") {
@@ -296,7 +298,7 @@ TEST_CASE("a sliver of an image is refused before it is padded or scaled") {
     REQUIRE(parsed.ok());
     std::vector<float> out(12);
     const Frame frame{width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * height * 3)};
-    return parsed->fit->apply(frame, out, "view");
+    return parsed->fit->apply(frame, 0, out, "view");
   };
   CHECK(contains(refusal(apply(1, 8000), Code::bad_observation),
                  "view: expected an image that padding and scaling make no larger than 1048576 pixels, found 1 x 8000, "
@@ -322,7 +324,7 @@ Json resized_twice(int width) {
 std::string refusal_of(const Recipe& recipe, int width, int height) {
   std::vector<float> out(static_cast<std::size_t>(3) * recipe.width * recipe.height);
   const Frame frame{width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * height * 3)};
-  const Status taken = recipe.fit->apply(frame, out, "view");
+  const Status taken = recipe.fit->apply(frame, 0, out, "view");
   return taken ? "" : taken.error().message();
 }
 
@@ -353,8 +355,8 @@ TEST_CASE("every filter on bytes resizes frames and images alike, and planes are
     REQUIRE_MESSAGE(first.ok(), first.error().message());
     REQUIRE_MESSAGE(second.ok(), second.error().message());
     std::vector<float> of_frame(45, -1.0f), of_image(45, -2.0f);
-    CHECK(first->fit->apply({6, 4, colours()}, of_frame, "view").ok());
-    CHECK(second->fit->apply({6, 4, colours()}, of_image, "view").ok());
+    CHECK(first->fit->apply({6, 4, colours()}, 0, of_frame, "view").ok());
+    CHECK(second->fit->apply({6, 4, colours()}, 0, of_image, "view").ok());
     CHECK(of_frame == of_image);
   }
   const Json planes = {{"op", "resize"}, {"width", 3}, {"height", 5}, {"filter", "torch_bilinear"}};
@@ -381,16 +383,16 @@ TEST_CASE("a frame of another camera than the policy was trained with is refused
   const auto parsed = parse_recipe(recipe.dump());
   REQUIRE(parsed.ok());
   std::vector<float> out(9);
-  CHECK(parsed->fit->apply({6, 4, colours()}, out, "view").ok());
+  CHECK(parsed->fit->apply({6, 4, colours()}, 0, out, "view").ok());
   // 3 of 6 columns leave 1.5 on each side, 1 of 4 rows the same: both are rounded to 2, the even number.
   CHECK(out[0] == doctest::Approx((2 * 38 + 2 * 91) % 256 / 255.0));
-  CHECK_FALSE(parsed->fit->apply({4, 6, colours()}, out, "view").ok());
+  CHECK_FALSE(parsed->fit->apply({4, 6, colours()}, 0, out, "view").ok());
   recipe["image"][1]["width"] = 7;
   recipe["image"][2]["width"] = 7;
   const auto wide = parse_recipe(recipe.dump());
   REQUIRE(wide.ok());
   std::vector<float> row(21);
-  CHECK_FALSE(wide->fit->apply({6, 4, colours()}, row, "view").ok());
+  CHECK_FALSE(wide->fit->apply({6, 4, colours()}, 0, row, "view").ok());
 }
 
 TEST_CASE("views behind the instruction are found from the end of the prompt, whatever its length") {
@@ -427,6 +429,32 @@ TEST_CASE("views behind the instruction are found from the end of the prompt, wh
   CHECK(contains(refusal(processor.encode(seen), Code::bad_observation), "shorten the instruction"));
 }
 
+TEST_CASE("frames of several cameras lie in the corner of a canvas") {
+  Json recipe = Json::parse(kRecipe);
+  recipe["image"] = {{{"op", "camera_size"}, {"view", 0}, {"width", 2}, {"height", 1}},
+                     {{"op", "camera_size"}, {"view", 1}, {"width", 1}, {"height", 2}},
+                     {{"op", "canvas"}, {"width", 2}, {"height", 2}},
+                     {{"op", "size"}, {"width", 2}, {"height", 2}}};
+  const auto parsed = parse_recipe(recipe.dump());
+  REQUIRE(parsed.ok());
+  const Fit& fit = *parsed->fit;
+  CHECK(fit.n_view() == 2);
+  CHECK((fit.camera_size(0)->width == 2 && fit.camera_size(1)->width == 1 && !fit.camera_size(2)));
+  const Frame wide{2, 1, std::vector<std::uint8_t>{51, 102, 153, 204, 255, 0}};
+  std::vector<float> out(12);
+  REQUIRE(fit.apply(wide, 0, out, "view").ok());
+  CHECK(out == std::vector<float>{0.2f, 0.8f, 0, 0, 0.4f, 1.0f, 0, 0, 0.6f, 0, 0, 0});
+  const Frame tall{1, 2, std::vector<float>{0.1f, 0.2f, 0.3f, 0.4f, 0.5f, 0.6f}};
+  REQUIRE(fit.apply(tall, 1, out, "view").ok());
+  CHECK(out == std::vector<float>{0.1f, 0, 0.4f, 0, 0.2f, 0, 0.5f, 0, 0.3f, 0, 0.6f, 0});
+  CHECK(contains(refusal(fit.apply(tall, 0, out, "view"), Code::bad_observation), "expected an image of 2 x 1"));
+  recipe["image"][2]["height"] = 1;
+  recipe["image"][3]["height"] = 1;
+  const auto low = parse_recipe(recipe.dump());
+  REQUIRE(low.ok());
+  CHECK_FALSE(low->fit->apply(tall, 1, std::span(out).first(6), "view").ok());
+}
+
 TEST_CASE("floats come as they are where no op changes a pixel, and are refused where one does") {
   Json recipe = Json::parse(kRecipe);
   recipe["image"] = {{{"op", "camera_size"}, {"width", 2}, {"height", 1}},
@@ -435,15 +463,15 @@ TEST_CASE("floats come as they are where no op changes a pixel, and are refused 
   REQUIRE(taken.ok());
   const Frame frame{2, 1, std::vector<float>{0.1f, 0.2f, 0.3f, 0.4f, 0.5f, 0.6f}};
   std::vector<float> out(6);
-  REQUIRE(taken->fit->apply(frame, out, "view").ok());
+  REQUIRE(taken->fit->apply(frame, 0, out, "view").ok());
   CHECK(out == std::vector<float>{0.1f, 0.4f, 0.2f, 0.5f, 0.3f, 0.6f});
   const Frame other{1, 2, std::vector<float>(6)};
-  CHECK(contains(taken->fit->apply(other, out, "view").error().message(), "expected an image of 2 x 1"));
+  CHECK(contains(taken->fit->apply(other, 0, out, "view").error().message(), "expected an image of 2 x 1"));
   const Json pad = {{"op", "square_pad"}};
   recipe["image"].insert(recipe["image"].begin() + 1, pad);
   recipe["image"][2]["height"] = 2;
   const auto padded = parse_recipe(recipe.dump());
   REQUIRE(padded.ok());
   std::vector<float> square(12);
-  CHECK(contains(padded->fit->apply(frame, square, "view").error().message(), "expected pixels of 8 bits"));
+  CHECK(contains(padded->fit->apply(frame, 0, square, "view").error().message(), "expected pixels of 8 bits"));
 }

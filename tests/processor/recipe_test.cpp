@@ -40,7 +40,7 @@ TEST_CASE("the recipe of the document is read op by op") {
   CHECK(recipe->width == 512);
   CHECK(recipe->height == 384);
   std::vector<float> planes(3 * 512 * 384);
-  REQUIRE(recipe->fit->apply(Frame{1, 2, std::vector<float>(6)}, planes, "top").ok());
+  REQUIRE(recipe->fit->apply(Frame{1, 2, std::vector<float>(6)}, 0, planes, "top").ok());
   CHECK(planes[0] == 0.5f);  // what a tall frame leaves at the left
   REQUIRE(recipe->image.size() == 1);
   recipe->image[0]->apply(planes);

@@ -77,13 +77,13 @@ TEST_CASE("a frame of another camera is refused, and the camera's size is told")
   op.update(from);
   const auto recipe = parsed(Json::array({op}));
   REQUIRE_MESSAGE(recipe.ok(), recipe.error().message());
-  const auto camera = recipe->fit->camera_size();
+  const auto camera = recipe->fit->camera_size(0);
   REQUIRE(camera);
   CHECK(camera->width == 6);
   CHECK(camera->height == 4);
   std::vector<float> planes(192);
-  CHECK(recipe->fit->apply(frame_of(6, 4), planes, "top").ok());
-  const Status status = recipe->fit->apply(frame_of(4, 6), planes, "top");
+  CHECK(recipe->fit->apply(frame_of(6, 4), 0, planes, "top").ok());
+  const Status status = recipe->fit->apply(frame_of(4, 6), 0, planes, "top");
   REQUIRE_FALSE(status.ok());
   CHECK(contains(status.error().message(), "top: expected an image of 6 x 4, found 4 x 6"));
 }
@@ -93,7 +93,7 @@ TEST_CASE("sizes follow each other, of the last one are the network's images") {
   REQUIRE_MESSAGE(recipe.ok(), recipe.error().message());
   CHECK(recipe->width == 8);
   CHECK(recipe->height == 6);
-  CHECK_FALSE(recipe->fit->camera_size());
+  CHECK_FALSE(recipe->fit->camera_size(0));
 }
 
 TEST_CASE("what the document does not say of resize_floats is refused") {

@@ -35,7 +35,7 @@ class Checkpoint:
     that bfloat16 holds are such weights again."""
 
     policy: dict
-    views: dict  # view -> (height, width), of one size
+    views: dict  # view -> (height, width)
     d_state: int = 6
     d_action: int = 7
     d_environment: int = 0
@@ -285,7 +285,8 @@ class Recorder(Taps):
         with torch.inference_mode():
             self.put("chunk", self.policy.predict_action_chunk(dict(batch))[0])
         for name, x in self.views.items():
-            self.put(name, torch.cat(x))
+            if len({view.shape for view in x}) == 1:
+                self.put(name, torch.cat(x))
         parts = [batch[name][0] for name in ("observation.state", ENVIRONMENT) if name in batch]
         self.put("state", torch.cat(parts))
         return self.taps

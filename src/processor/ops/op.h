@@ -44,14 +44,16 @@ class Fit {
  public:
   virtual ~Fit() = default;
   virtual const char* described() const = 0;
-  /// The only frames that are taken, where the recipe says so.
-  virtual std::optional<CameraSize> camera_size() const { return {}; }
+  /// The only frames of a view that are taken, where the recipe says so.
+  virtual std::optional<CameraSize> camera_size(int /*view*/) const { return {}; }
+  /// One more than the last view that the recipe names, 0 where it names none.
+  virtual int n_view() const { return 0; }
   /// The sizes of its resizes in floats, behind which more may follow; null of any other fit.
   virtual std::vector<Resize>* float_sizes() { return nullptr; }
   /// What it computes beside making the planes, for a frame of this size, in pixels of about 10 ns.
   virtual std::int64_t work(int /*width*/, int /*height*/) const { return 0; }
-  /// Writes (3, height, width) float32 in [0, 1]. Errors: bad_observation, at `where`.
-  virtual Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const = 0;
+  /// Writes (3, height, width) float32 in [0, 1] for this view. Errors: bad_observation, at `where`.
+  virtual Status apply(const Frame& frame, int view, std::span<float> planes, const std::string& where) const = 0;
 };
 
 /// A fit by one function of what the recipe says.
@@ -62,7 +64,7 @@ class OneFit : public Fit {
 
   OneFit(const char* described, Run* run, Op given = {}) : op(std::move(given)), described_(described), run_(run) {}
   const char* described() const override { return described_; }
-  Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const override {
+  Status apply(const Frame& frame, int /*view*/, std::span<float> planes, const std::string& where) const override {
     return run_(frame, op, planes, where);
   }
 

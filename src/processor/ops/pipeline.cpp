@@ -42,6 +42,7 @@ Size size_after(const CropFraction& op, const Size& from) {
 }
 
 Size size_after(const JpegRoundTrip&, const Size& from) { return from; }
+Size size_after(const ViewCamera&, const Size& from) { return from; }
 
 /// The size that an op states.
 template <class Op>
@@ -77,6 +78,17 @@ Image centred(const Image& from, int width, int height) {
   return to;
 }
 
+/// Rows of pixels at the start of wider ones; the rest is zero.
+template <class T>
+std::vector<T> on_canvas(std::span<const T> rgb, int width, const Canvas& canvas) {
+  std::vector<T> out(static_cast<std::size_t>(canvas.width) * static_cast<std::size_t>(canvas.height) * 3);
+  const std::size_t from = 3 * static_cast<std::size_t>(width), to = 3 * static_cast<std::size_t>(canvas.width);
+  for (std::size_t y = 0; y < rgb.size() / from; ++y)
+    std::copy_n(rgb.begin() + static_cast<std::ptrdiff_t>(y * from), from,
+                out.begin() + static_cast<std::ptrdiff_t>(y * to));
+  return out;
+}
+
 /// Ops that make of a frame an image whose size the recipe does not state.
 bool follows_frame(const ByteOp& op) {
   return std::holds_alternative<SquarePad>(op) || std::holds_alternative<SmallestSide>(op);
@@ -95,6 +107,9 @@ Image applied(const ByteOp& op, const Image& from, int width, int height) {
     return {width, height,
             std::get<ResizeBytes>(resize->filter->resize)(from.rgb, from.width, from.height, width, height)};
   if (std::holds_alternative<ExpectSize>(op)) return from;
+  if (std::holds_alternative<ViewCamera>(op)) return from;
+  if (const auto* canvas = std::get_if<Canvas>(&op))
+    return {width, height, on_canvas<std::uint8_t>(from.rgb, from.width, *canvas)};
   if (const auto* crop = std::get_if<CenterCrop>(&op)) return cropped(from, *crop);
   if (const auto* crop = std::get_if<CropAndResize>(&op))
     return {width, height, crop_tensorflow(from.rgb, from.width, from.height, crop->area, width, height)};
@@ -106,19 +121,38 @@ Image applied(const ByteOp& op, const Image& from, int width, int height) {
 /// Whether frames of the stated camera are the images, since no op changes a pixel.
 bool keeps_pixels(const Pipeline& pipeline) {
   return !pipeline.ops.empty() && std::all_of(pipeline.ops.begin(), pipeline.ops.end(), [](const ByteOp& op) {
-    return std::holds_alternative<CameraSize>(op) || std::holds_alternative<ExpectSize>(op);
+    return std::holds_alternative<ViewCamera>(op) || std::holds_alternative<ExpectSize>(op) ||
+           std::holds_alternative<Canvas>(op);
   });
+}
+
+/// Float pixels as planes: on the canvas, if there is one.
+void spread_floats(const std::vector<float>& rgb, int width, const Pipeline& pipeline, std::span<float> out) {
+  const auto as_is = [](float value) { return value; };
+  for (const ByteOp& op : pipeline.ops)
+    if (const auto* canvas = std::get_if<Canvas>(&op))
+      return spread(std::span<const float>(on_canvas<float>(rgb, width, *canvas)), out, as_is);
+  spread(std::span(rgb), out, as_is);
+}
+
+/// The camera of a view, or nullptr if its frames may have any size.
+const ViewCamera* camera_of(const Pipeline& pipeline, int view) {
+  for (const ByteOp& op : pipeline.ops)
+    if (const auto* camera = std::get_if<ViewCamera>(&op);
+        camera != nullptr && (camera->view == ViewCamera::kEvery || camera->view == view))
+      return camera;
+  return nullptr;
 }
 
 }  // namespace
 
-Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where) {
+Status run_pipeline(const Frame& frame, int view, const Pipeline& pipeline, std::span<float> out,
+                    const std::string& where) {
   const auto* floats = std::get_if<std::vector<float>>(&frame.rgb);
   if (floats != nullptr && !keeps_pixels(pipeline))
     return Error{Code::bad_observation, where, "pixels of 8 bits", "float pixels",
                  "send the camera's bytes: this policy's images are cut and resized as bytes"};
-  for (const ByteOp& op : pipeline.ops)
-    if (const auto* camera = std::get_if<CameraSize>(&op)) VLA_CHECK(check_camera(frame, *camera, where));
+  if (const ViewCamera* camera = camera_of(pipeline, view)) VLA_CHECK(check_camera(frame, camera->size, where));
   // All sizes come before any image, so that none is made which nothing needs or no memory holds.
   const double most_grown = most_pixels_grown(frame);
   std::vector<Size> sizes = {{static_cast<double>(frame.width), static_cast<double>(frame.height)}};
@@ -134,6 +168,8 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
       return another_aspect(size->width, size->height);
     if (const auto* crop = std::get_if<CenterCrop>(&op))
       fits &= crop->width <= sizes.back().width && crop->height <= sizes.back().height;
+    if (const auto* canvas = std::get_if<Canvas>(&op))
+      fits &= canvas->width >= sizes.back().width && canvas->height >= sizes.back().height;
     sizes.push_back(std::visit([&](const auto& o) { return size_after(o, sizes.back()); }, op));
     const double n_pixel = sizes.back().width * sizes.back().height;
     if (follows_frame(op) && n_pixel > most_grown)
@@ -147,7 +183,7 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   if (!fits || sizes.back() != Size{static_cast<double>(pipeline.width), static_cast<double>(pipeline.height)})
     return another_aspect(pipeline.width, pipeline.height);
   if (floats != nullptr) {
-    spread(std::span(*floats), out, [](float value) { return value; });
+    spread_floats(*floats, frame.width, pipeline, out);
     return {};
   }
   Image image{frame.width, frame.height, std::get<std::vector<std::uint8_t>>(frame.rgb)};
@@ -179,16 +215,26 @@ std::int64_t pipeline_work(const Pipeline& pipeline, int width, int height) {
 
 namespace {
 
-constexpr std::size_t kMaxByteOps = 16;
+constexpr std::size_t kMaxByteOps = kMaxViews + 16;
 
-struct PipelineFit final : OneFit<Pipeline> {
-  PipelineFit() : OneFit("padded, scaled and cropped as the recipe says", run_pipeline) {}
-  std::optional<CameraSize> camera_size() const override {
+struct PipelineFit final : Fit {
+  const char* described() const override { return "padded, scaled and cropped as the recipe says"; }
+  Status apply(const Frame& frame, int view, std::span<float> planes, const std::string& where) const override {
+    return run_pipeline(frame, view, op, planes, where);
+  }
+  std::optional<CameraSize> camera_size(int view) const override {
+    const ViewCamera* camera = camera_of(op, view);
+    return camera != nullptr ? std::optional(camera->size) : std::nullopt;
+  }
+  int n_view() const override {
+    int n = 0;
     for (const ByteOp& each : op.ops)
-      if (const auto* camera = std::get_if<CameraSize>(&each)) return *camera;
-    return {};
+      if (const auto* camera = std::get_if<ViewCamera>(&each)) n = std::max(n, camera->view + 1);
+    return n;
   }
   std::int64_t work(int width, int height) const override { return pipeline_work(op, width, height); }
+
+  Pipeline op;
 };
 
 /// The pipeline that the next op belongs to.
@@ -234,6 +280,16 @@ Status parse_crop_and_resize(JsonFields& fields, Recipe& recipe) {
   return add(fields, recipe, op);
 }
 
+Status parse_camera_size(JsonFields& fields, Recipe& recipe) {
+  ViewCamera op;
+  VLA_TRY(op.size.width, fields.integer("width", 1, kMaxImageSide));
+  VLA_TRY(op.size.height, fields.integer("height", 1, kMaxImageSide));
+  if (fields.has("view")) {
+    VLA_TRY(op.view, fields.integer("view", 0, kMaxViews - 1));
+  }
+  return add(fields, recipe, op);
+}
+
 template <class Op>
 Status parse_stated_size(JsonFields& fields, Recipe& recipe) {
   Op op;
@@ -246,7 +302,7 @@ Status parse_stated_size(JsonFields& fields, Recipe& recipe) {
 bool has_any_aspect(const Pipeline& pipeline) {
   bool any = false;
   for (const ByteOp& op : pipeline.ops) {
-    if (std::holds_alternative<SquarePad>(op) || std::holds_alternative<CameraSize>(op)) return false;
+    if (std::holds_alternative<SquarePad>(op) || std::holds_alternative<ViewCamera>(op)) return false;
     any = (any || std::holds_alternative<SmallestSide>(op)) && !std::holds_alternative<ExpectSize>(op);
   }
   return any;
@@ -282,7 +338,8 @@ Ops pipeline_ops() {
           {"image", "crop_and_resize", parse_crop_and_resize},
           {"image", "lanczos3", parse_stated_size<Lanczos3>},
           {"image", "expect_size", parse_stated_size<ExpectSize>},
-          {"image", "camera_size", parse_stated_size<CameraSize>},
+          {"image", "camera_size", parse_camera_size},
+          {"image", "canvas", parse_stated_size<Canvas>},
           {"image", "center_crop", parse_stated_size<CenterCrop>},
           {"image", "size", parse_size}};
 }

@@ -58,8 +58,22 @@ struct JpegRoundTrip {
   int quality = 0;
 };
 
-using ByteOp = std::variant<JpegRoundTrip, SquarePad, SmallestSide, CropFraction, Resize, ExpectSize, CameraSize,
-                            CenterCrop, Lanczos3, CropAndResize>;
+/// Frames of one view's camera alone, or of every view's.
+struct ViewCamera {
+  static constexpr int kEvery = -1;
+
+  CameraSize size;
+  int view = kEvery;
+};
+
+/// The image in the upper left corner of a larger one, which is black beyond it.
+struct Canvas {
+  int width = 0;
+  int height = 0;
+};
+
+using ByteOp = std::variant<JpegRoundTrip, SquarePad, SmallestSide, CropFraction, Resize, ExpectSize, ViewCamera,
+                            CenterCrop, Lanczos3, CropAndResize, Canvas>;
 
 /// Ops on 8-bit images in order, and the size that the last one must leave.
 struct Pipeline {
@@ -72,7 +86,8 @@ struct Pipeline {
 /// where no op changes a pixel, and is refused otherwise, since the reference gets bytes; so is one whose aspect leads
 /// to another size than the network takes. Source: lerobot policies/groot/processor_groot.py
 /// (_transform_n1_7_image_for_vlm_albumentations). Errors: bad_observation.
-Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where);
+Status run_pipeline(const Frame& frame, int view, const Pipeline& pipeline, std::span<float> out,
+                    const std::string& where);
 
 /// Checks that a frame is of the camera whose frames alone are taken. Errors: bad_observation.
 Status check_camera(const Frame& frame, const CameraSize& camera, const std::string& where);

@@ -45,7 +45,7 @@ constexpr std::size_t kMaxSizes = 4;
 
 struct FloatFit final : OneFit<FloatResizes> {
   FloatFit() : OneFit("resized", resize_floats) {}
-  std::optional<CameraSize> camera_size() const override { return op.camera; }
+  std::optional<CameraSize> camera_size(int /*view*/) const override { return op.camera; }
   std::vector<Resize>* float_sizes() override { return &op.sizes; }
 };
 

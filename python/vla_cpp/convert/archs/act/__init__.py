@@ -35,13 +35,17 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def recipe_document(s: Sizes, processors: recipe.Processors, problems: Problems) -> Dict[str, List[dict]]:
-    """The reference resizes nothing: frames of another size than the data set's are refused."""
+    """The reference resizes nothing: frames of another size than the data set's are refused. Frames of several sizes lie in the corner of
+    images of one size, out of which the network takes them."""
     width, height = s.frame
     size = {"width": width, "height": height}
+    several = len(set(s.frames)) > 1
+    cameras = [{"view": i, "width": w, "height": h} for i, (w, h) in enumerate(s.frames)] if several else [size]
     states = [(recipe.STATE, processors.state)] + ([(ENVIRONMENT, processors.others[ENVIRONMENT])] if s.d_environment else [])
     return {
         "image": [
-            {"op": "camera_size", **size},
+            *({"op": "camera_size", **camera} for camera in cameras),
+            *([{"op": "canvas", **size}] if several else []),
             {"op": "size", **size},
             *standardized([(view, processors.others[view]) for view in s.views], problems),
         ],

@@ -34,6 +34,7 @@ POLICY = {
     "latent_dim": 32,
     "n_vae_encoder_layers": 4,
     "temporal_ensemble_coeff": None,
+    "normalization_mapping": {"VISUAL": "MEAN_STD", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"},
 }
 FIXED = {"replace_final_stride_with_dilation": (False, "torchvision has no ResNet-18 or -34 with dilation either")}
 # Keys that no number of an action chunk depends on, beside those of every policy of LeRobot.
@@ -41,13 +42,14 @@ IGNORED = set("pretrained_backbone_weights dropout kl_weight optimizer_lr_backbo
 # torchvision models/resnet.py: blocks of each stage. Those of the others have another block.
 BACKBONES = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
 ACTIVATIONS = {"relu": "relu", "gelu": "gelu_erf"}
-MAX_LAYERS, MAX_SIDE = 512, 8192
+MAX_LAYERS, MAX_SIDE, MAX_VIEWS = 512, 8192, 32
 
 
 @dataclass
 class Sizes:
     views: Sequence[str]
-    frame: Tuple[int, int]  # width, height
+    frame: Tuple[int, int]  # width, height of the images: the largest sides of the views' frames
+    frames: Sequence[Tuple[int, int]]  # of each view
     d_state: int
     d_environment: int  # 0: there is none
     d_action: int
@@ -72,12 +74,13 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     check_widths(policy, {})
     _check_words(policy)
     _note_ensemble(policy, checkpoint)
-    views, frame = _read_views(policy)
+    views, frames = _read_views(policy)
     features = policy.get("input_features")
     has_environment = isinstance(features, dict) and ENVIRONMENT in features
     s = Sizes(
         views=views,
-        frame=frame,
+        frame=(max(width for width, _ in frames), max(height for _, height in frames)),
+        frames=frames,
         d_state=state_width(policy, checkpoint, options, padded=False),
         d_environment=vector_dim(policy, "input_features", ENVIRONMENT, "ENV") if has_environment else 0,
         d_action=action_width(policy, checkpoint, options),
@@ -114,6 +117,7 @@ def _check_words(policy: Section) -> None:
             policy.bad(key, "true or false")
     if not isinstance(policy.get("normalization_mapping"), dict):
         policy.bad("normalization_mapping", "the modes of VISUAL, STATE and ACTION")
+    policy.values.setdefault("normalization_mapping", POLICY["normalization_mapping"])  # for those who read it of the older layout
 
 
 def _note_ensemble(policy: Section, checkpoint: Checkpoint) -> None:
@@ -133,8 +137,8 @@ def _note_ensemble(policy: Section, checkpoint: Checkpoint) -> None:
         )
 
 
-def _read_views(policy: Section) -> Tuple[Sequence[str], Tuple[int, int]]:
-    """Cameras in their order, and the size of their frames. What the reference does not read is refused: it may be a misspelt feature."""
+def _read_views(policy: Section) -> Tuple[Sequence[str], Sequence[Tuple[int, int]]]:
+    """Cameras in their order, and the sizes of their frames. What the reference does not read is refused: it may be a misspelt feature."""
     features = policy.get("input_features")
     views, sizes = [], []
     for name, feature in (features if isinstance(features, dict) else {}).items():
@@ -151,7 +155,6 @@ def _read_views(policy: Section) -> Tuple[Sequence[str], Tuple[int, int]]:
     if not views:
         hint = "an ACT without cameras is not supported"
         policy.bad("input_features", "a VISUAL feature or several", "none", hint, unsupported=True)
-    elif len(set(sizes)) > 1:
-        found = ", ".join("{} x {}".format(*size) for size in sizes)
-        policy.bad("input_features", "cameras of one size", found, unsupported=True)
-    return views, sizes[0] if sizes else (1, 1)
+    elif len(views) > MAX_VIEWS:
+        policy.bad("input_features", "at most {} cameras".format(MAX_VIEWS), str(len(views)), unsupported=True)
+    return views, sizes or [(1, 1)]

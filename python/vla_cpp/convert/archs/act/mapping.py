@@ -25,13 +25,18 @@ def network_keys(s: Sizes) -> List[Key]:
     return keys_of(
         {
             "policy": dict(states, **pick(s, "d_action horizon")),
-            "vision": dict(image_width=s.frame[0], image_height=s.frame[1], n_block=s.n_block),
+            "vision": dict(image_width=s.frame[0], image_height=s.frame[1], n_block=s.n_block, **of_views(s)),
             "transformer": dict(pick(s, "d_model n_head d_ff"), **order),
             "encoder": dict(n_layer=s.n_encoder),
             "decoder": dict(n_layer=s.n_decoder),
             "solver": dict(steps=1, kind="direct", noise="none"),
         }
     )
+
+
+def of_views(s: Sizes) -> Dict[str, List[int]]:
+    """Sizes of the views' frames, where they are not all the images'."""
+    return {"view_sizes": [side for size in s.frames for side in size]} if len(set(s.frames)) > 1 else {}
 
 
 def weights(s: Sizes) -> Rows:
