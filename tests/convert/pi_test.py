@@ -269,6 +269,23 @@ def test_missing_quantiles_can_be_passed_over_only_in_words(converter):
     assert any("DEGRADED" in note for note in converter.summary.notes)
 
 
+def test_a_base_policy_whose_normalizers_list_no_feature_needs_statistics_or_leave(converter):
+    tiny = TinyPi("pi05")
+    converter.save(tiny)
+    for name in ("policy_preprocessor", "policy_postprocessor"):
+        file = converter.folder / f"{name}.json"
+        pipeline = json.loads(file.read_text())
+        for step in pipeline["steps"]:
+            if "norm_map" in step["config"]:
+                step["config"]["features"] = {}
+                del step["state_file"]
+        file.write_text(json.dumps(pipeline))
+    error = converter.refusal().message()
+    assert "--identity-stats observation.state" in error and "--identity-stats action" in error
+    found = recipe(converter.bundle(identity_stats=["observation.state", "action"]))
+    assert [op["op"] for op in found["state"]] == ["bins"] and [op["op"] for op in found["action"]] == ["take"]
+
+
 @pytest.mark.parametrize(
     "family, total, count", [(pi0.FAMILY, 3_238_048_528, 776), (pi05.FAMILY, 3_353_433_872, 811)]
 )

@@ -208,11 +208,13 @@ class _Reader:
         keys = member(config, "normalize_observation_keys", list, where)
         if config.get("normalize_observation_keys") is not None and STATE not in keys:
             self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
-        stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
+        features = member(config, "features", dict, where)
+        stated = member(features, STATE, dict, where + ": features")
         width = self.context.dims[STATE]
         listed = member(member(self.checkpoint.config, "input_features", dict, "config.json"), STATE, dict, "config.json: input_features")
         widths = ([width], [self.context.min_widths.get(STATE, width)], listed.get("shape"))
-        if stated.get("shape") not in widths or stated.get("type") != "STATE":
+        of_base = not features and step.get("state_file") is None  # a base policy as LeRobot publishes it: without statistics
+        if not of_base and (stated.get("shape") not in widths or stated.get("type") != "STATE"):
             self.problems.add("{}: features.{}".format(where, STATE), "STATE of [{}] as in config.json".format(width), str(stated)[:80])
         self.result.state = self.normalization(where, config, step, STATE, "STATE")
 
