@@ -145,6 +145,75 @@ def setting(key, name, value):
     return lambda tiny: tiny.norm_stats[key].update({name: value})
 
 
+OWN = {
+    "model": "pi05", "views": {"front": "image", "wrist": ""}, "states": {"arm": 6, "hand": 2}, "actions": 7, "horizon": 9, "relative": [0, 1],
+    "discrete_state": False, "assets": "my/robot",
+}
+
+
+def own(converter, tiny=None, **changed):
+    """Saves a checkpoint of an embodiment that no configuration of openpi has. Returns the file that describes it."""
+    tiny = tiny or TinyOpenpi("pi05", "my/robot")
+    converter.save(tiny)
+    (converter.folder / "own.json").write_text(json.dumps({**OWN, **changed}))
+    return "own.json"
+
+
+def test_a_configuration_of_ones_own_is_stated_in_a_file(converter):
+    bundle = converter.bundle(variant=own(converter))
+    assert bundle.keys["observation.views"] == ["observation.images.front", "observation.images.wrist"]
+    assert bundle.keys["observation.view_aliases"] == ["image", ""] and bundle.keys["observation.state_dims"] == [6, 2]
+    assert bundle.keys["policy.horizon"] == 7  # config.json's action_horizon counts
+    found = recipe(bundle)
+    assert found["action"][-1] == {"op": "add_state", "columns": [0, 1]} and found["state"][-1] == {"op": "drop"}
+    assert bundle.tensors["stats.action.q01"].shape == (7,)
+
+
+def test_it_is_as_the_configuration_of_that_name(converter):
+    libero = {"model": "pi0", "views": {"image": "observation/image", "wrist_image": "observation/wrist_image"}, "states": {"state": 8}, "actions": 7,
+              "horizon": 50, "relative": list(range(6)), "discrete_state": True, "assets": "physical-intelligence/libero"}
+    named = converter.bundle(openpi("pi0_libero"), variant="pi0_libero")
+    stated = converter.bundle(variant=own(converter, openpi("pi0_libero"), **libero))
+    assert stated.keys == named.keys
+    assert all(np.array_equal(stated.tensors[name], values) for name, values in named.tensors.items())
+
+
+def test_it_may_be_for_a_robot_of_openpi(converter):
+    tiny = TinyOpenpi("pi05", "trossen")
+    converter.save(tiny)
+    (converter.folder / "own.json").write_text(json.dumps({"model": "pi05", "robot": "aloha", "horizon": 50, "assets": "trossen"}))
+    found = recipe(converter.bundle(variant="own.json"))
+    assert [op["op"] for op in found["state"]] == ["affine", "horn_angle", "affine", "normalize", "bins"]
+    assert [op["op"] for op in found["action"]] == ["take", "unnormalize", "affine", "affine"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"model": "pi0_fast"}, "model: expected pi0 or pi05"),
+        ({"views": {}}, "views: expected 1 to 3 views"),
+        ({"views": {name: "" for name in "abcd"}}, "views: expected 1 to 3 views"),
+        ({"views": ["front"]}, "views: expected 1 to 3 views"),
+        ({"states": {"arm": 0}}, "states: expected widths"),
+        ({"states": {"arm": True}}, "states: expected widths"),
+        ({"actions": None}, "actions: expected a whole number"),
+        ({"horizon": 0}, "horizon: expected a whole number"),
+        ({"relative": [7]}, "relative: expected columns below 7"),
+        ({"relative": [True]}, "relative: expected columns below 7"),
+        ({"relative": "all"}, "relative: expected columns of actions"),
+        ({"discrete_state": 1}, "discrete_state: expected true or false"),
+        ({"assets": ""}, "assets: expected a folder below assets"),
+        ({"assets": "../elsewhere"}, "assets: expected a folder below assets"),
+        ({"gripper": "binary"}, "gripper: expected one of model, robot"),
+        ({"robot": "aloha"}, "robot: expected either a robot of openpi, or views"),
+        ({"robot": "umi"}, "robot: expected aloha or droid or libero"),
+        ({"robot": ["aloha"]}, "robot: expected aloha or droid or libero"),
+    ],
+)
+def test_what_such_a_file_may_not_say_is_refused(converter, changed, message):
+    assert message in converter.refusal(variant=own(converter, **changed)).message()
+
+
 REFUSED = {
     "norm_stats.state.std: expected 8 numbers, found none": without("state", "std"),
     "norm_stats.actions.mean: expected 7 numbers, found none": without("actions", "mean"),

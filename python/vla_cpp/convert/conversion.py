@@ -63,7 +63,7 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
     elif checkpoint.layout == LEROBOT:
         archs.told_by_tensors(checkpoint)
     archs.check_options(checkpoint.layout, checkpoint.config, options)
-    arch = archs.arch_of(checkpoint.config, checkpoint.layout, options.variant)
+    arch = archs.arch_of(checkpoint, options.variant)
     checkpoint.robot = options.stats
     plan = plan_robots(archs.load(arch), checkpoint, options, problems)
     add_units(plan, options.units, checkpoint.notes, problems)

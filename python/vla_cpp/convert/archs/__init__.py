@@ -155,9 +155,10 @@ def check_options(layout: str, config: dict, options: Options) -> None:
     problems.raise_any()
 
 
-def arch_of(config: dict, layout: str, variant: str) -> str:
+def arch_of(checkpoint: Checkpoint, variant: str) -> str:
     """LeRobot states the architecture; in an openpi checkpoint nothing does, and `variant` names the configuration that it
-    was trained with. Errors: usage, unsupported."""
+    was trained with, or a file that states it. Errors: usage, unsupported."""
+    config, layout = checkpoint.config, checkpoint.layout
     if layout == LEROBOT and "type" not in config and "model_type" in config:
         known = [name for each in authors().values() for name in each.model_types]
         raise refuse("config.json: model_type", "one of " + ", ".join(known), str(config["model_type"]), "", Code.UNSUPPORTED)
@@ -166,10 +167,12 @@ def arch_of(config: dict, layout: str, variant: str) -> str:
     variants = {name: arch for arch in names() for name in getattr(load(arch), "VARIANTS", ())}
     if variant in variants:
         return variants[variant]
+    if variant.endswith(".json"):
+        return load("pi0").read_variant(checkpoint, variant).arch
     raise refuse(
         "--variant",
-        "the name of the openpi configuration that the checkpoint was trained with: " + ", ".join(sorted(variants)),
+        "the name of the openpi configuration that the checkpoint was trained with, or a JSON file with one: " + ", ".join(sorted(variants)),
         variant or "none",
-        "an openpi checkpoint does not state its robot; other variants have recipes that are not known",
+        "an openpi checkpoint does not state its robot; docs/converting.md has the fields of a configuration of one's own",
         Code.UNSUPPORTED if variant else Code.USAGE,
     )

@@ -17,7 +17,7 @@ from ...lerobot import given_tokenizer
 from ...recipe import recipe_key
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from .. import Options, Plan
-from .layouts import read_lerobot, read_openpi, variants_of
+from .layouts import read_lerobot, read_openpi, read_variant, variants_of
 from .mapping import Family, canonical, dropped, hints, network_keys, rename, rounded, weights
 
 TOKENIZER = "google/paligemma-3b-pt-224"  # a literal of the reference
@@ -57,4 +57,5 @@ def _check_newline(text: List[dict], tokenizer: TokenizerPlan, problems: Problem
 
 FAMILY = Family(arch="pi0", config_class="PI0Config", max_tokens=48, time_mlp="action_time_mlp", other_time_mlp="time_mlp")
 VARIANTS = variants_of("pi0")
+__all__ = ["FAMILY", "VARIANTS", "make_plan", "plan", "read_variant"]
 plan = partial(make_plan, FAMILY)

@@ -236,6 +236,7 @@ DROID = Robot(
 LIBERO = Robot(
     views=(("image", "observation/image", False), ("wrist_image", "observation/wrist_image", False)), states=(("state", 8),), n_action=7
 )
+ROBOTS = {"aloha": ALOHA, "droid": DROID, "libero": LIBERO}
 # Joints that actions are relative to; grippers are absolute (make_bool_mask).
 ALOHA_JOINTS = [*range(6), *range(7, 13)]
 
@@ -274,8 +275,72 @@ def variants_of(arch: str) -> List[str]:
     return [name for name, variant in VARIANTS.items() if variant.arch == arch]
 
 
+def read_variant(checkpoint: Checkpoint, name: str) -> Variant:
+    """The configuration of that name, or that a JSON file states, which lies there or in the checkpoint."""
+    if name in VARIANTS:
+        return VARIANTS[name]
+    path = name if os.path.exists(name) else checkpoint.path(name)
+    given = Section(name, member({"it": read_json(path)}, "it", dict, name), VARIANT_FILE, Problems(name))
+    for key in sorted(set(given.values) - set(VARIANT_FILE)):
+        given.bad(key, "one of " + ", ".join(VARIANT_FILE))
+    own = given.get("robot") not in [*ROBOTS]
+    if not own and set(given.values) & {"views", "states", "actions"}:
+        given.bad("robot", "either a robot of openpi, or views, states and actions")
+    elif given.get("robot") and own:
+        given.bad("robot", " or ".join(ROBOTS))
+    robot = _own_robot(given) if own else ROBOTS[given.get("robot")]
+    if given.get("model") not in ("pi0", "pi05"):
+        given.bad("model", "pi0 or pi05")
+    for key in ("discrete_state", "relative", "assets"):
+        kind = type(VARIANT_FILE[key])
+        if not isinstance(given.get(key), kind):
+            given.bad(key, {bool: "true or false", list: "columns of actions", str: "a folder below assets"}[kind])
+    horizon = given.count("horizon", maximum=4096)
+    given.problems.raise_any()
+    relative, most = given.get("relative"), min(robot.n_action, sum(width for _, width in robot.states))
+    if any(isinstance(i, bool) or not isinstance(i, int) or not 0 <= i < most for i in relative):
+        given.bad("relative", "columns below {}, which state and actions have".format(most))
+    if any(part in ("", ".", "..") for part in given.get("assets").split("/")):
+        given.bad("assets", "a folder below assets")
+    given.problems.raise_any()
+    return Variant(given.get("model"), robot, given.get("assets"), horizon, relative, given.get("discrete_state"))
+
+
+def _own_robot(given: Section) -> Robot:
+    views, states = given.get("views"), given.get("states")
+    if not _names(views, str) or len(views) > MAX_VIEWS:
+        given.bad("views", "1 to {} views, each with its name in the client's observations, in the order of the network's".format(MAX_VIEWS))
+    if not _names(states, int):
+        given.bad("states", "widths of one state or several, in their order")
+    n_action = given.count("actions")
+    given.problems.raise_any()
+    return Robot([(view, alias, False) for view, alias in views.items()], list(states.items()), n_action)
+
+
+# A TrainConfig of one's own: for a robot of openpi, or for one whose transforms do no more than name, normalize and make relative.
+VARIANT_FILE: Dict[str, object] = {
+    "model": "",
+    "robot": "",
+    "views": {},
+    "states": {},
+    "actions": None,
+    "horizon": None,
+    "relative": [],
+    "discrete_state": True,
+    "assets": "",
+}
+MAX_VIEWS = 3  # of openpi's models
+
+
+def _names(value: object, kind: type) -> bool:
+    """Whether it has names for values of that kind, widths greater than zero."""
+    if not isinstance(value, dict) or not value:
+        return False
+    return all(key and isinstance(x, kind) and not isinstance(x, bool) and (kind is str or x > 0) for key, x in value.items())
+
+
 def read_openpi(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Source:
-    variant = VARIANTS[options.variant]
+    variant = read_variant(checkpoint, options.variant)
     robot = variant.robot
     policy = Section("config.json", checkpoint.config, dict(OPENPI_CONFIG, action_horizon=variant.horizon), problems)
     for key in sorted(set(policy.values) - set(policy.defaults)):
