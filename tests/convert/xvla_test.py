@@ -3,6 +3,7 @@
 """X-VLA: names against the reference's and the runtime's, both spellings of its backbone, domains, its tokenizer, refusals."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ import pytest
 from configs import of_config, sizes_of
 from goldens import xvla
 from manifests import check_keys, check_parameters
-from vla_cpp.convert.archs import Options
+from vla_cpp.convert.archs import Options, load
 from vla_cpp.convert.archs.xvla import mapping
 from vla_cpp.convert.archs.xvla.config import read_sizes
 from vla_cpp.convert.checkpoint import open_checkpoint
 from vla_cpp.convert.conversion import _pieces, convert_checkpoint
-from vla_cpp.convert.errors import ConvertError
+from vla_cpp.convert.embodiments import plan_robots
+from vla_cpp.convert.errors import ConvertError, Problems
 
 ARCH = "xvla"
 VIEWS = {"top": (33, 40), "wrist": (20, 24)}
@@ -121,6 +123,16 @@ def test_several_domains_share_all_but_their_layers(planned):
     layers = [f"{layer}.{part}" for layer in ("action_in", "action_out") for part in ("weight", "bias")]
     assert own == {f"embodiment.{i}.{name}" for i in range(3) for name in (*layers, "prompt.weight")}
     assert keys["embodiments"] == ["0", "1", "2"] and not any(name.startswith("embodiment.") for name in keys)
+
+
+def test_without_proprioception_the_state_that_robots_send_is_taken_and_not_read(tmp_path):
+    checkpoint = replace(xvla.CASES["xvla/long_text"].checkpoint, d_state=5)
+    checkpoint.write(1, tmp_path / "policy")
+    made = plan_robots(load(ARCH), open_checkpoint(str(tmp_path / "policy"), {}), Options(), Problems("test"))
+    keys = {key.name: key.value for key in made.keys}
+    assert keys["observation.states"] == ["observation.state"] and keys["observation.state_dims"] == [5]
+    assert json.loads(keys["processor.recipe"])["state"] == [{"op": "drop"}]
+    assert keys["policy.d_state"] == 0 and "stats.observation.state.mean" not in made.statistics
 
 
 @pytest.mark.parametrize("domain", ["3", "-1", "01", "arm"])

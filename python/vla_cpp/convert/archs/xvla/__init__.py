@@ -62,7 +62,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     views = view_keys(checkpoint, s.views, processors, problems)
     keys = [
         *network_keys(s),
-        *robot_keys(views, dims, options.dataset_info, checkpoint.notes, problems, processors.max_tokens),
+        *robot_keys(views, {**({recipe.STATE: s.unread_dim} if s.unread_dim else {}), **dims}, options.dataset_info, checkpoint.notes, problems, processors.max_tokens),
         *tokenizer.keys,
         recipe.recipe_key(recipe_document(s, processors, tokenizer.truncate, NORMALIZE in steps)),
     ]
@@ -96,9 +96,15 @@ def recipe_document(s: Sizes, processors: recipe.Processors, truncate: str, is_n
     return {
         "image": fit + ([{"op": "standardize", **IMAGENET, "arithmetic": "float32"}] if is_normalized else []),
         "text": recipe.text_ops(processors, truncate),
-        "state": [*processors.state.op("normalize", recipe.STATE), {"op": "pad", "size": s.d_state}] if s.state_dim else [],
+        "state": _state(s, processors),
         "action": [*grippers, *take, *processors.action.op("unnormalize", recipe.ACTION)],
     }
+
+
+def _state(s: Sizes, processors: recipe.Processors) -> List[dict]:
+    if s.state_dim:
+        return [*processors.state.op("normalize", recipe.STATE), {"op": "pad", "size": s.d_state}]
+    return [{"op": "drop"}] if s.unread_dim else []
 
 
 def _pad_token(folder: str, tokenizer: TokenizerPlan, problems: Problems) -> int:

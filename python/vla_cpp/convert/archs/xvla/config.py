@@ -16,7 +16,7 @@ from ...errors import Code, Problems
 from ...files import member
 from ...lerobot import EMPTY_CAMERA, action_width, check_keys, check_widths, no_position_rule, read_views, state_width
 from ...networks import MAX_LAYERS, NORM_EPS, TextEncoder
-from ...recipe import ACTION
+from ...recipe import ACTION, STATE
 from ...section import Section
 from .. import Options
 
@@ -120,6 +120,7 @@ class Sizes:
     frame: Tuple[int, int] = (0, 0)  # width, height
     resizes: bool = False
     state_dim: int = 0  # 0: the policy reads none
+    unread_dim: int = 0  # of a state that robots send and the network does not read
     action_dim: int = 0
     d_state: int = 0
     d_action: int = 0
@@ -203,6 +204,8 @@ def _read_spaces(policy: Section, checkpoint: Checkpoint, options: Options, s: S
     if policy.get("use_proprio") is True:
         s.state_dim = state_width(policy, checkpoint, options)
         s.d_state = policy.count("max_state_dim")
+    elif STATE in member(checkpoint.config, "input_features", dict, "config.json"):
+        s.unread_dim = state_width(policy, checkpoint, options)
     check_widths(policy, {"max_state_dim": (s.d_state, s.state_dim), "max_action_dim": (s.d_action, s.action_dim)})
     lowest = max(s.grippers, default=-1) + 1
     if s.grippers and (s.d_state < lowest or s.d_state != (space.state or s.d_state)):
