@@ -83,6 +83,9 @@ def as_published(checkpoint: Checkpoint, options: Options) -> Options:
 def _steps(checkpoint: Checkpoint) -> Dict[str, dict]:
     """The settings of the steps by their names. Errors: unsupported for other steps than those of N1.7."""
     found: Dict[str, dict] = {}
+    base = str(checkpoint.config.get("base_model_path"))
+    if "n1.5" in base.lower():
+        raise refuse("config.json: base_model_path", "GR00T N1.7", base, OTHERS["groot_pack_inputs"], Code.UNSUPPORTED)
     if checkpoint.processors is None:
         raise refuse(checkpoint.path(PRE), "LeRobot's pipelines", "none", "save the policy with its processors", Code.UNSUPPORTED)
     for (file, wanted), pipeline in zip(STEPS.items(), checkpoint.processors):
