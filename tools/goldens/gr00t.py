@@ -88,7 +88,7 @@ class Checkpoint:
     @property
     def robots(self):
         other, index, robot = OTHER
-        return {self.tag: (self.index, self.robot), other: (index, robot)}
+        return {self.tag: (self.index, self.robot)} | ({} if other == self.tag else {other: (index, robot)})
 
     def language_shapes(self, at):
         """Qwen3: the layers that the policy keeps."""

@@ -318,8 +318,10 @@ class RobotNumbers:
                 y = np.where(table["std"] == 0, x, x * table["std"] + table["mean"])
             else:
                 y = (np.clip(x, -1, 1) + 1) / 2 * (high - low) + low
-            reference = states[how["state_key"] or key]
-            out.append(y if not relative else y + reference if how["type"] == "NON_EEF" else composed(reference, y))
+            if relative:
+                reference = states[how["state_key"] or key]
+                y = y + reference if how["type"] == "NON_EEF" else composed(reference, y)
+            out.append(y)
         return np.concatenate(out, -1).astype(np.float32)
 
 
