@@ -237,6 +237,12 @@ def test_a_damaged_file_is_refused(tmp_path, text):
         Limits.read(tmp_path / "x.json")
 
 
+@pytest.mark.parametrize("path", ["/dev/zero", "/", "nothing.json"])
+def test_what_is_no_file_is_refused_without_being_read(path):
+    with pytest.raises(UsageError, match="found no regular file"):
+        Limits.read(path)
+
+
 def test_limits_of_another_robot_are_refused():
     with pytest.raises(UsageError, match="without grip"):
         Limits.parse({**GOOD, "columns": {"pan": GOOD["columns"]["pan"]}}).of(SPEC)

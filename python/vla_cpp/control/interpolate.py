@@ -20,8 +20,8 @@ from typing import Any, Dict, Sequence, Tuple
 
 import numpy as np
 
-from ..errors import BadAction, UsageError
-from .limits import KINDS
+from ..errors import UsageError
+from .limits import KINDS, finite_row
 
 # Coefficients of s^0 ... s^5, s from 0 to 1 over a period, from: place, velocity and acceleration at 0; the same at 1.
 METHODS: Dict[str, np.ndarray] = {
@@ -72,7 +72,7 @@ class Interpolator:
 
     def start_at(self, values: Any) -> None:
         """The robot rests at these values; of velocities and differences zero is meant."""
-        self._command = np.where(self._is_place, self._read("start_at", values), 0.0)
+        self._command = np.where(self._is_place, finite_row("start_at", values, len(self._is_place)), 0.0)
         self._coefficients[:] = 0
         self._coefficients[0] = self._command
         self._s = 1.0
@@ -82,7 +82,7 @@ class Interpolator:
 
         Errors: UsageError before `start_at`; BadAction for a value that is not finite.
         """
-        wanted = self._read("command", values)
+        wanted = finite_row("command", values, len(self._is_place))
         if np.isnan(self._command).any():
             raise UsageError("command", "start_at first: where the robot is", "nothing")
         place, velocity, acceleration = self._motion(self._s)
@@ -109,9 +109,3 @@ class Interpolator:
         power = [s**k, k * s ** np.maximum(k - 1, 0), k * (k - 1) * s ** np.maximum(k - 2, 0)]
         place, velocity, acceleration = (p @ self._coefficients for p in power)
         return place, velocity, acceleration
-
-    def _read(self, where: str, values: Any) -> np.ndarray:
-        values = np.array(values, np.float64)
-        if values.shape != self._is_place.shape or not np.isfinite(values).all():
-            raise BadAction(where, f"{len(self._is_place)} finite numbers", str(values))
-        return values

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
@@ -26,12 +27,15 @@ from typing import Any, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tup
 import numpy as np
 
 from ..errors import BadAction, UsageError
+from ..output import write_text
 from ..spec import Spec
+from ..strict_json import no_constant, unique_names
 
 FORMAT = "vla-limits 1"
 KINDS = ("position", "velocity", "difference")
 N_HALF = 16  # halvings of the search for a permitted command
 MAX_STOP = 4096  # steps of the longest stop that is looked for
+MAX_FILE = 1 << 20  # bytes
 FAR = 1e9  # in place of a limit that is not given
 SLACK = 1e-9  # of rounding in double, relative to the limit
 
@@ -80,8 +84,10 @@ class Limits:
     def read(path: Union[str, Path]) -> Limits:
         """A file that `write` wrote or a person: docs/control.md."""
         try:
+            if not os.path.isfile(path) or os.path.getsize(path) > MAX_FILE:
+                raise ValueError(f"no regular file of at most {MAX_FILE} bytes")
             text = Path(path).read_text("utf-8")
-            return Limits.parse(json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_each_once))
+            return Limits.parse(json.loads(text, parse_constant=no_constant, object_pairs_hook=unique_names))
         except (OSError, ValueError, RecursionError) as error:
             raise UsageError(str(path), "a file of limits in JSON", str(error)) from None
 
@@ -98,7 +104,7 @@ class Limits:
     def write(self, path: Union[str, Path]) -> None:
         columns = {c.name: _document(c) for c in self.columns}
         document = {"format": FORMAT, "columns": columns, "refuse_above": self.refuse_above}
-        Path(path).write_text(json.dumps(document, indent=2) + "\n", "utf-8")
+        write_text(path, json.dumps(document, indent=2) + "\n")
 
     @staticmethod
     def suggest(
@@ -179,7 +185,7 @@ class Limiter:
 
         Errors: UsageError for a position outside of its limits, from which no command would be permitted.
         """
-        values = self._read("rest_at", values)
+        values = finite_row("rest_at", values, len(self._is_place))
         outside = self._is_place & ((values < self._low) | (values > self._high))
         if outside.any():
             i = int(np.argmax(outside))
@@ -193,7 +199,7 @@ class Limiter:
 
         Errors: UsageError before `rest_at` where there is a position; BadAction for a value that is not finite.
         """
-        wanted = self._read("command", values)
+        wanted = finite_row("command", values, len(self._is_place))
         if np.isnan(self._place).any():
             raise UsageError("limits", "where the robot is: rest_at, or start_at of the loop", "nothing")
         change = np.where(self._is_place, wanted - self._place, wanted) - self._velocity
@@ -225,12 +231,6 @@ class Limiter:
         return broken.any(1)
 
     # --- inside ----------------------------------------------------------------------------------------------------------------
-
-    def _read(self, where: str, values: Any) -> np.ndarray:
-        values = np.array(values, np.float64)
-        if values.shape != self._is_place.shape or not np.isfinite(values).all():
-            raise BadAction(where, f"{len(self._is_place)} finite numbers", str(values))
-        return values
 
     def _span(self) -> Tuple[np.ndarray, np.ndarray]:
         """The least and the largest acceleration that keep every limit in this step."""
@@ -315,6 +315,14 @@ class Limiter:
         return np.where(after, 0.0, low), np.where(after, 0.0, high)
 
 
+def finite_row(where: str, values: Any, n: int) -> np.ndarray:
+    """One number for each of n columns, in double. Errors: BadAction."""
+    row = np.array(values, np.float64)
+    if row.shape != (n,) or not np.isfinite(row).all():
+        raise BadAction(where, f"{n} finite numbers", str(values))
+    return row
+
+
 def _padded(steps: np.ndarray, n: int) -> np.ndarray:
     return np.concatenate([steps, np.zeros((n - len(steps), steps.shape[1]))])
 
@@ -333,16 +341,6 @@ def _number(where: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= FAR:
         raise UsageError(where, f"a number up to {FAR:g}", str(value)[:80])
     return float(value)
-
-
-def _each_once(pairs: List[Tuple[str, Any]]) -> Dict[str, Any]:
-    if len(dict(pairs)) < len(pairs):
-        raise ValueError("a name twice in one object")
-    return dict(pairs)
-
-
-def _refuse_constant(text: str) -> None:
-    raise ValueError(f"{text} is no number of JSON")
 
 
 def _parse_column(name: str, given: Any) -> Column:

@@ -10,13 +10,10 @@ import stat
 from typing import BinaryIO
 
 from ..installed import extra_hint
+from ..strict_json import no_constant
 from .errors import Code, ConvertError, refuse
 
 MAX_JSON = 256 << 20  # the tokenizers of the largest vocabularies take some 20 MB
-
-
-def _no_constant(name: str):
-    raise ValueError("the number {} is not JSON".format(name))
 
 
 def open_file(path: str) -> BinaryIO:
@@ -55,7 +52,7 @@ def read_json(path: str) -> dict:
     """A JSON object. Errors: io when it cannot be read, bad_bundle when it is something else."""
     data = read_file(path)
     try:
-        value = json.loads(data.decode("utf-8"), parse_constant=_no_constant)
+        value = json.loads(data.decode("utf-8"), parse_constant=no_constant)
     except (ValueError, RecursionError) as error:
         raise refuse(path, "JSON", str(error)[:200], "the file is damaged: download or save it again")
     if not isinstance(value, dict):

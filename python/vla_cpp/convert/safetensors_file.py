@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections import Counter
 from typing import Dict, Iterator, NamedTuple, Tuple
 
 import numpy as np
 
+from ..strict_json import unique_names
 from .dtypes import SIZES, STATISTICS
 from .errors import refuse
 from .files import open_file
@@ -59,13 +59,6 @@ class SafetensorsFile(NamedTuple):
     metadata: Dict[str, str]
 
 
-def _unique(pairs):
-    (key, count), *_ = Counter(key for key, _ in pairs).most_common(1) or [("", 0)]
-    if count > 1:
-        raise ValueError("the name {} stands twice".format(key))
-    return dict(pairs)
-
-
 def check_count(where: str, n_tensor: int) -> None:
     """Before anything is made for each of them. Errors: bad_bundle."""
     if n_tensor > MAX_TENSORS:
@@ -86,7 +79,7 @@ def _read_header(path: str) -> Tuple[dict, int, int]:
         text = file.read(length)
     check_count(path, text.count(b'"data_offsets"'))
     try:
-        header = json.loads(text.decode("utf-8"), object_pairs_hook=_unique)
+        header = json.loads(text.decode("utf-8"), object_pairs_hook=unique_names)
     except (ValueError, RecursionError) as error:
         raise refuse(path, "a safetensors header in JSON", str(error)[:200], hint)
     if not isinstance(header, dict):
