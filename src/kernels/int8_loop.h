@@ -16,9 +16,11 @@ namespace vla::kernels {
 
 /// Turns a row's sums into values; the weights have an offset: float(sum) * (scale of W, or of its column / s of the
 /// row).
+/// Integers wrap: a prediction (lower/cpu/predict.cpp) multiplies rows that nothing has rounded.
 template <class V, class Weights, int kColumns, int kOffset>
 VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const RowScale& row, const std::int32_t* from,
                            float* to) {
+  const auto offset = static_cast<std::int32_t>(kOffset * static_cast<std::uint32_t>(row.sum));
   for (std::int64_t n = 0; n < kColumns; n += V::width) {
     typename V::Int sums;
     std::memcpy(&sums, from + n, sizeof(sums));
@@ -27,7 +29,7 @@ VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const R
       step = load<V>(part.scale + s.column + n, s.n_column > n ? s.n_column - n : 0) / row.s;
     else
       step = V::set(*part.scale / row.s);
-    V::store(to + n, __builtin_convertvector(sums - kOffset * row.sum, typename V::Float) * step);
+    V::store(to + n, __builtin_convertvector(sums - offset, typename V::Float) * step);
   }
 }
 

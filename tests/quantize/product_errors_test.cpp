@@ -6,6 +6,7 @@
 
 #include <doctest/doctest.h>
 
+#include "base/process.h"
 #include "support/editable_bundle.h"
 #include "support/stored.h"
 
@@ -58,7 +59,8 @@ TEST_CASE("dividing channels is kept where they were too large, and left where t
   REQUIRE(write_smoothed(sick, all, scalings).ok());
   const Judged seen = observation();
   const CodedPair pair = {coded(sick, "plain.gguf"), coded(all, "smoothed.gguf")};
-  for (const std::size_t memory : {std::size_t{0}, std::size_t{64} << 20}) {
+  const std::size_t little = resident_size() + (std::size_t{32} << 20);
+  for (const std::size_t memory : {std::size_t{0}, little}) {
     CAPTURE(memory);
     const auto helpful = helpful_scalings(sick, pair, Rounding::int8, scalings, std::span(&seen, 1),
                                           {.n_thread = 1, .all_robots = true, .memory = memory});
