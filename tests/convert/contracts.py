@@ -12,11 +12,13 @@ import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax_checkpoint
 import numpy as np
 from goldens import act, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, smolvla
 from goldens.cases import Case, backbone_folder, conversion_options, write_checkpoint
 from goldens.files import write_json, write_safetensors
 from vla_cpp.convert import cli
+from vla_cpp.convert.dtypes import to_f32
 from vla_cpp.convert.safetensors_file import read_safetensors
 
 ROWS = json.loads((Path(__file__).parent / "contracts.json").read_text())
@@ -139,12 +141,17 @@ def openpi_case(row):
 
 
 def as_openpi(row, checkpoint, folder):
-    """The folder that openpi's PyTorch code saves, of LeRobot's."""
+    """The folder that openpi's PyTorch code saves, or where the row has ranks of LoRA its JAX code, of LeRobot's."""
     folder.mkdir()
     shutil.copy(checkpoint / "dims.json", folder)
     shutil.copytree(checkpoint / "tokenizer", folder / "tokenizer")
-    write_json(folder / "config.json", {"action_dim": 32, "action_horizon": openpi_robot(row)[3], "precision": "float32"} | row.get("config", {}))
-    rename_tensors(checkpoint / "model.safetensors", folder / "model.safetensors", lambda name: name.removeprefix("model."))
+    if "jax_lora" in row:
+        tensors = {name: to_f32(values(entry), entry.dtype) for name, entry in read_safetensors(str(checkpoint / "model.safetensors")).entries.items()}
+        dims = json.loads((checkpoint / "dims.json").read_text())
+        jax_checkpoint.write(folder / "params", jax_checkpoint.arrays_of(tensors, dims, dict(zip(("", "_1"), row["jax_lora"]))))
+    else:
+        write_json(folder / "config.json", {"action_dim": 32, "action_horizon": openpi_robot(row)[3], "precision": "float32"} | row.get("config", {}))
+        rename_tensors(checkpoint / "model.safetensors", folder / "model.safetensors", lambda name: name.removeprefix("model."))
     numbers = next(read_safetensors(str(file)).entries for file in sorted(checkpoint.glob("policy_preprocessor_step_*.safetensors")))
     stats = {key: {part: [float(x) for x in values(numbers[f"{feature}.{part}"])] for part in ("mean", "std", "q01", "q99")}
              for key, feature in (("state", STATE), ("actions", "action"))}

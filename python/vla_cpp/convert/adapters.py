@@ -109,8 +109,8 @@ class Adapter(NamedTuple):
 
 
 def stored_dtype(entry) -> str:
-    """Of a sum, that of the base's tensor."""
-    return entry.stored if isinstance(entry, Merged) else entry.dtype
+    """Of a sum or another computed tensor, that of the base's tensor."""
+    return getattr(entry, "stored", entry.dtype)
 
 
 def is_adapter_name(name: str) -> bool:

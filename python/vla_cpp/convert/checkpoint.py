@@ -142,7 +142,7 @@ def open_checkpoint(source: str, authors: Mapping[str, Layout], base: str = "") 
     sizes = _opened(base) if base and states_no_sizes(folder) else None
     below = None if sizes else _base_of(folder, base)  # where the weights are
     # openpi's training writes no config.json, its converter from JAX one without a type.
-    has_assets = os.path.isdir(os.path.join(folder, "assets"))
+    has_assets = any(os.path.isdir(os.path.join(folder, name)) for name in ("assets", "params"))
     own = folder if os.path.exists(os.path.join(folder, "config.json")) or not below else below.folder
     has_config = os.path.exists(os.path.join(own, "config.json"))
     config = read_json(os.path.join(own, "config.json")) if has_config or not has_assets else {}

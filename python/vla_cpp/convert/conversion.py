@@ -55,7 +55,7 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
         return _convert_to_codes(source, out, options, force, progress)
     _check_state_bound(options)
     vla = find(options.vla)
-    checkpoint = open_checkpoint(source, archs.authors(), options.base)
+    checkpoint = open_checkpoint(source, archs.told_by_files(), options.base)
     options = options.replaced(backbone=given_backbone(checkpoint, options.backbone))
     problems = Problems(checkpoint.name)
     if checkpoint.config.get("type") == GROOT:

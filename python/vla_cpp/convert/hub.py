@@ -35,6 +35,7 @@ HUB_PATTERNS = [
     "vlm/merges.txt",
     "processor/*.json",
     "assets/*",
+    "params/*",
 ]
 BACKBONE_PATTERNS = [
     "config.json",

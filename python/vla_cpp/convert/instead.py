@@ -27,7 +27,7 @@ def instead_of(source: str) -> str:
 
 def check_is_policy(folder: str) -> None:
     """Refuses a folder that has policies only further down. Errors: io."""
-    names = [name for name in ("model.safetensors", "model.safetensors.index.json", "assets", "adapter_config.json") if _has(folder, name)]
+    names = [name for name in ("model.safetensors", "model.safetensors.index.json", "assets", "params", "adapter_config.json") if _has(folder, name)]
     if _has(folder, "config.json") or names:
         return
     policies = _policies_below(folder)

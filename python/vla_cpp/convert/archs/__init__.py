@@ -15,7 +15,7 @@ from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 import numpy as np
 
 from ..bundle import Key
-from ..checkpoint import LEROBOT, OPENPI, Checkpoint, Layout
+from ..checkpoint import LEROBOT, OPENPI, Checkpoint, Layout, Tensors, read_stored
 from ..errors import Code, Problems, refuse
 from ..options import COMMON, DOMAIN, IDENTITY_STATS, POSITION_PRECISION, WIDTHS, Option, stats, variant
 
@@ -96,12 +96,22 @@ def groot_as_published(checkpoint: Checkpoint, options: Options) -> Options:
     return _module("gr00t.lerobot_layout").as_published(checkpoint, options)
 
 
+def _openpi_tensors(folder: str, problems: Problems) -> Tensors:
+    jax = _module("pi0.jax_layout")
+    return jax.read_jax(folder, problems) if jax.is_jax(folder) else read_stored(folder, problems)
+
+
 LAYOUTS = {
     LEROBOT: Layout(
         "LeRobot", (IDENTITY_STATS, POSITION_PRECISION, WIDTHS, DOMAIN, stats("whose, where the weights have those of several data sets"))
     ),
-    OPENPI: Layout("openpi", (variant("the training configuration, e.g. pi05_droid"),)),
+    OPENPI: Layout("openpi", (variant("the training configuration, e.g. pi05_droid"),), files=("params/_METADATA",), read=_openpi_tensors),
 }
+
+
+def told_by_files() -> Dict[str, Layout]:
+    """The layouts that have a reader or files of their own."""
+    return {**authors(), OPENPI: LAYOUTS[OPENPI]}
 
 
 def authors() -> Dict[str, Layout]:

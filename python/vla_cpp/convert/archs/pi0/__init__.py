@@ -26,6 +26,9 @@ TOKENIZER = "google/paligemma-3b-pt-224"  # a literal of the reference
 def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     read = read_openpi if checkpoint.layout == OPENPI else read_lerobot
     source = read(family, checkpoint, options, problems)
+    merged = sum(getattr(tensor, "has_adapter", False) for tensor in checkpoint.tensors.values())
+    if merged:
+        checkpoint.notes.append("LoRA of openpi's training: merged into {} tensors".format(merged))
     checkpoint.tensors = rename(checkpoint.tensors, family.time_mlp, family.other_time_mlp, checkpoint.notes, problems)
     if checkpoint.adapter:
         checkpoint.adapter = checkpoint.adapter.renamed(lambda name: canonical(name, family.time_mlp, family.other_time_mlp))

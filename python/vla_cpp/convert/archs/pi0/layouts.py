@@ -7,7 +7,7 @@
 Reference: lerobot src/lerobot/policies/{pi0,pi05}/{configuration,processor,modeling}_*.py. An absent key means the default of the
 reference's own class, which is stated here beside the key.
 
-π0 and π0.5 as openpi's PyTorch code saves them: weights, and statistics under assets/. Everything else about a robot stands in
+π0 and π0.5 as openpi saves them: weights, of its PyTorch code or of its JAX code (jax_layout.py), and statistics under assets/. Everything else about a robot stands in
 openpi's own training configurations, so those with a published recipe stand here, by their names.
 
 Reference: openpi src/openpi/training/config.py, policies/{aloha,droid,libero}_policy.py, transforms.py, models/tokenizer.py.
@@ -262,6 +262,7 @@ VARIANTS = {
     "pi0_aloha_sim": Variant("pi0", ALOHA, "lerobot/aloha_sim_transfer_cube_human"),
     "pi0_droid": Variant("pi0", DROID, "droid", horizon=10),
     "pi0_libero": Variant("pi0", LIBERO, LIBERO_ASSET, relative=range(6)),
+    "pi0_libero_low_mem_finetune": Variant("pi0", LIBERO, LIBERO_ASSET, relative=range(6)),  # with LoRA
     "pi05_aloha": Variant("pi05", ALOHA, "trossen", relative=ALOHA_JOINTS),
     "pi05_aloha_pen_uncap": Variant("pi05", ALOHA, "trossen", relative=ALOHA_JOINTS),
     "pi05_droid": Variant("pi05", DROID, "droid", horizon=15),

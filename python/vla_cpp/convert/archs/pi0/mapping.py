@@ -69,7 +69,7 @@ class Sizes:
 def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> Sizes:
     """The sizes of the three towers; `policy` names the variants of two."""
     dims = _dims(checkpoint, problems)
-    lm, expert = (_gemma(policy, key, dims, problems) for key in ("paligemma_variant", "action_expert_variant"))
+    lm, expert = (_gemma(policy, key, dims, checkpoint, problems) for key in ("paligemma_variant", "action_expert_variant"))
     vision = Section(DIMS_FILE + ": vision", member(dims, "vision", dict, DIMS_FILE), SIGLIP, problems)
     _known(vision)
     for key in ("depth", "num_heads", "num_kv_heads", "head_dim"):
@@ -121,10 +121,15 @@ def _dims(checkpoint: Checkpoint, problems: Problems) -> dict:
     return dims
 
 
-def _gemma(policy: Section, key: str, dims: dict, problems: Problems) -> Section:
+LORA = "openpi's converter to PyTorch leaves LoRA out: give the folder that its training wrote, with params/"
+
+
+def _gemma(policy: Section, key: str, dims: dict, checkpoint: Checkpoint, problems: Problems) -> Section:
     variant = policy.get(key)
+    if any(getattr(tensor, "has_adapter", False) for tensor in checkpoint.tensors.values()) and isinstance(variant, str):
+        variant = variant[: -len("_lora")] if variant.endswith("_lora") else variant
     if not isinstance(variant, str) or variant not in VARIANTS:
-        policy.bad(key, " or ".join(VARIANTS), unsupported=True, hint="merge adapters into the policy and save it again")
+        policy.bad(key, " or ".join(VARIANTS), unsupported=True, hint=LORA)
         variant = "gemma_300m"
     section = Section("{}: {}".format(DIMS_FILE, variant), member(dims, variant, dict, DIMS_FILE), VARIANTS[variant], problems)
     _known(section)
