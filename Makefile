@@ -73,7 +73,7 @@ deb:
 	@scripts/packages.sh deb
 	@test -f build/deb/CMakeCache.txt || cmake -S . -B build/deb -G Ninja -DCMAKE_BUILD_TYPE=Release -DCMAKE_INSTALL_PREFIX=/usr \
 	  -DVLA_BUILD_TESTS=OFF -DVLA_DEB=ON $(CMAKE_ARGS)
-	cmake --build build/deb --target vla vla_shared
+	cmake --build build/deb --target vla vla_shared vla_control_shared
 	cpack --config build/deb/CPackConfig.cmake -B out
 	@rm -rf out/_CPack_Packages
 	$(PYTHON) scripts/sbom.py build/deb out

@@ -20,6 +20,12 @@ if(VLA_BUILD_SERVER)  # where `vla serve` looks for it; a Python wheel has it be
 endif()
 install(TARGETS vla_shared EXPORT vlaTargets
         LIBRARY DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT library NAMELINK_COMPONENT development)
+if(VLA_BUILD_SERVER)
+  set_target_properties(vla_control_shared PROPERTIES INSTALL_RPATH "$ORIGIN")
+  install(TARGETS vla_control_shared EXPORT vlaTargets LIBRARY DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT control
+          NAMELINK_COMPONENT development)
+  install(FILES include/vla/control.h DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/vla)
+endif()
 install(FILES include/vla/vla.h DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/vla)
 install(FILES src/wire/vla.proto DESTINATION ${CMAKE_INSTALL_DATADIR}/vla)
 if(NOT CMAKE_CROSSCOMPILING OR CMAKE_CROSSCOMPILING_EMULATOR)

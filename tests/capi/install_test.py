@@ -5,6 +5,7 @@
 import os
 import re
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -31,6 +32,13 @@ def test_exactly_the_functions_of_the_header_are_exported(build):
     assert len(declared) > 10 and {line.split()[-1] for line in lines} == declared
 
 
+def test_the_library_of_the_loop_exports_its_namespace_alone(build):
+    lines = run("nm", "--dynamic", "--defined-only", "--demangle", build / "lib/libvla-control.so").splitlines()
+    names = [re.sub(r"^[0-9a-f]+ \w (typeinfo (name )?for |vtable for )?", "", line) for line in lines]
+    assert any(name.startswith("vla::control::ChunkLoop::step") for name in names)
+    assert [name for name in names if not name.startswith("vla::control::")] == []
+
+
 def test_ggml_and_our_own_rooms_are_inside_the_library_and_its_name_has_the_version(build):
     dynamic = run("readelf", "--dynamic", "--wide", build / "lib/libvla.so")
     version = re.search(r"#define VLA_ABI_VERSION (\d+)", HEADER.read_text())[1]
@@ -42,6 +50,7 @@ def test_an_installation_has_these_files_and_no_others(prefix, build):
     files = {path.relative_to(prefix).as_posix() for path in prefix.rglob("*") if not path.is_dir()}
     assert files == {
         "bin/vla", "libexec/vla/vla-door-lerobot", "include/vla/vla.h", "lib/libvla.so", "lib/libvla.so.1", "lib/pkgconfig/vla.pc",
+        "include/vla/control.h", "lib/libvla-control.so.0.1", "lib/libvla-control.so.0.1.0",
         *(f"lib/cmake/vla/{f}.cmake" for f in ("vlaConfig", "vlaConfigVersion", "vlaTargets", "vlaTargets-release")),
         "share/doc/vla/LICENSE", "share/doc/vla/LICENSES-third-party.md", "share/vla/vla.proto",
         "share/man/man1/vla.1", "share/bash-completion/completions/vla",
@@ -59,7 +68,7 @@ def test_an_outside_project_finds_the_package_and_gets_the_bytes_of_vla_run(
 ):
     """tests/capi/outside is copied away, so that nothing of this tree is found by accident; it builds both examples."""
     shutil.copytree(ROOT / "tests/capi/outside", tmp_path / "outside")
-    for example in ("c/act.c", "cpp/act.cpp"):
+    for example in ("c/act.c", "cpp/act.cpp", "cpp/controller.cpp"):
         shutil.copy(ROOT / "examples" / example, tmp_path / "outside")
     moved = shutil.copytree(prefix, tmp_path / "moved", symlinks=True)  # an installation may be moved
     run("cmake", "-S", tmp_path / "outside", "-B", tmp_path / "build", f"-DCMAKE_PREFIX_PATH={moved}")
@@ -69,6 +78,8 @@ def test_an_outside_project_finds_the_package_and_gets_the_bytes_of_vla_run(
     for program in ("act_c", "act_cpp"):
         got = floats(run(tmp_path / "build" / program, *example_arguments(golden, 5)))
         assert got.tobytes() == expected.tobytes()
+    told = subprocess.run([tmp_path / "build/controller"], capture_output=True, text=True)
+    assert told.returncode == 2 and "controller ADDRESS LIMITS TEXT SECONDS VIEW=FILE" in told.stderr
 
 
 def test_a_later_minor_version_is_not_taken_for_this_one(prefix, tmp_path):

@@ -34,6 +34,7 @@ MAY_INCLUDE = {
     "net": {"base"},
     "zmtp": {"base", "net"},
     "wire": {"base"},
+    "control": {"base", "wire"},  # a library of its own
     "observe": {"base", "engine", "net", "wire"},
     "serve": {"engine", "processor", "bundle", "base", "net", "zmtp", "wire", "observe"},
     "door": {"base", "net", "wire", "serve"},  # the process that a front end has of its own
@@ -48,14 +49,14 @@ EXTERNAL = [
     (re.compile(r"vulkan/.*"), {"vulkan"}),
     (re.compile(r"cuda_runtime_api\.h|cublas_v2\.h"), {"cuda"}),
     (re.compile(r"CLI/.*"), {"cli"}),
-    (re.compile(r"nlohmann/.*"), {"processor", "cli", "observe", "serve", "bench"}),
+    (re.compile(r"nlohmann/.*"), {"processor", "cli", "observe", "serve", "bench", "control"}),
     (re.compile(r"jpeglib\.h"), {"processor"}),
     (re.compile(r"utf8proc\.h"), {"processor"}),
     (re.compile(r"png\.h"), {"processor", "bench"}),
     (re.compile(r"google/protobuf/.*"), {"wire", "observe", "serve"}),
     (re.compile(r"nghttp2/.*"), {"door"}),
     (re.compile(r"prometheus/.*"), {"observe", "cli"}),  # cli keeps the metrics
-    (re.compile(r"zmq\.h(pp)?"), {"observe", "zmtp"}),  # of a client; keys in Z85
+    (re.compile(r"zmq\.h(pp)?"), {"observe", "zmtp", "control"}),  # of a client; keys in Z85
     (re.compile(r"boost/.*"), {"net", "zmtp", "observe", "serve", "door"}),
     (re.compile(r"msgpack\.hpp"), {"serve"}),
     (re.compile(r"sodium\.h"), {"zmtp"}),

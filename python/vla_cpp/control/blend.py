@@ -14,6 +14,7 @@ the share r goes from some source to another, D apart at most.) What a blend doe
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Optional, Sequence
 
@@ -93,5 +94,6 @@ class Ensemble(Blend):
             raise UsageError("decay", "a finite number, 0 or more", str(self.decay))
 
     def weights(self, sources: Sequence[Source], step: int) -> np.ndarray:
-        weights = np.exp(-self.decay * np.arange(len(sources)))
-        return weights / weights.sum()
+        # Of the C library and summed in order, as the loop in C++ does it: numpy's own differ in the last bit.
+        weights = np.array([math.exp(-self.decay * i) for i in range(len(sources))])
+        return weights / np.cumsum(weights)[-1]

@@ -211,7 +211,7 @@ class Limiter:
         self._velocity = self._velocity + best
         out = np.where(self._is_place, self._place + self._velocity, self._velocity)
         is_cut = out.astype(np.float32) != wanted.astype(np.float32)
-        out = np.where(is_cut, out, wanted)
+        out = np.where(is_cut, out + 0.0, wanted)
         self._place = np.where(self._is_place, out, 0.0)
         self._stop = stops
         return out.astype(np.float32), is_cut
@@ -269,16 +269,17 @@ class Limiter:
         place = np.where(self._is_place, self._place + velocity, 0.0)
         n = self._least_steps(velocity, change)
         low, high = self._bounds(change, n)
-        room = (high - low).sum(0)
-        share = np.clip(np.divide(-velocity - low.sum(0), room, out=np.zeros_like(room), where=room > 0), 0, 1)
+        after = np.arange(1, len(low) + 1)[:, None] > n + 1
+        room = _total(high - low)
+        share = np.clip(np.divide(-velocity - _total(low), room, out=np.zeros_like(room), where=room > 0), 0, 1)
         steps = low + share * (high - low)
         speeds = velocity + np.cumsum(steps, 0)
         places = place + np.cumsum(speeds, 0)
         slack = SLACK * (1 + np.abs(self._fastest))
         found = (n >= 0) & (velocity >= self._slowest - slack) & (velocity <= self._fastest + slack)
-        found &= ((speeds >= self._slowest - slack) & (speeds <= self._fastest + slack)).all(0)
+        found &= (after | ((speeds >= self._slowest - slack) & (speeds <= self._fastest + slack))).all(0)
         edge = SLACK * (1 + np.where(self._is_place, np.abs(place), 0.0))
-        within = (places >= self._low - edge) & (places <= self._high + edge)
+        within = after | ((places >= self._low - edge) & (places <= self._high + edge))
         found &= ~self._is_place | (within.all(0) & (place >= self._low - edge) & (place <= self._high + edge))
         return Stops(found, steps)
 
@@ -286,9 +287,9 @@ class Limiter:
         """The least number of steps in which each column can rest; -1 where it is beyond MAX_STOP."""
 
         def enough(n: np.ndarray) -> np.ndarray:
-            low, high = self._bounds(change, n)
             slack = SLACK * (1 + np.abs(velocity))
-            return (low <= high + SLACK).all(0) & (low.sum(0) <= -velocity + slack) & (high.sum(0) >= -velocity - slack)
+            rests = np.abs(change) <= (n + 1) * self._jerk + SLACK
+            return rests & (self._least_sum(change, n) <= -velocity + slack) & (-self._least_sum(-change, n) >= -velocity - slack)
 
         few, many = np.full(len(change), -1), np.zeros(len(change), int)
         ok = enough(many)
@@ -301,6 +302,14 @@ class Limiter:
             ok = enough(middle)
             few, many = np.where(ok, few, middle), np.where(ok, middle, many)
         return np.where(reachable, many, -1)
+
+    def _least_sum(self, change: np.ndarray, n: np.ndarray) -> np.ndarray:
+        """The sum of the least accelerations of `_bounds` over n steps: they fall by the jerk from this one, stay at their least, and
+        rise by the jerk to rest."""
+        most, jerk = self._acceleration, self._jerk
+        fall = np.clip(np.floor(np.minimum((change + most) / jerk, ((n + 1) * jerk + change) / (2 * jerk))), 0, n)
+        rise = np.minimum(n - fall, np.floor(most / jerk))
+        return fall * change - jerk * (fall * (fall + 1) / 2 + rise * (rise + 1) / 2) - (n - fall - rise) * most
 
     def _bounds(self, change: np.ndarray, n: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
         """The least and largest accelerations of steps 1 to n from this one to rest: [steps, columns], zeros after n.
@@ -323,6 +332,11 @@ def finite_row(where: str, values: Any, n: int) -> np.ndarray:
     return row
 
 
+def _total(rows: np.ndarray) -> np.ndarray:
+    """The sum of rows, added one after the other whatever their number, as the loop in C++ adds them."""
+    return np.cumsum(rows, 0)[-1]
+
+
 def _padded(steps: np.ndarray, n: int) -> np.ndarray:
     return np.concatenate([steps, np.zeros((n - len(steps), steps.shape[1]))])
 
@@ -330,7 +344,7 @@ def _padded(steps: np.ndarray, n: int) -> np.ndarray:
 def _scale(kind: str, rate_hz: float) -> Tuple[float, float, float]:
     """Factors from units and seconds to changes a step: of velocity, acceleration and jerk."""
     first = 1.0 if kind == "velocity" else 1 / rate_hz
-    return first, first / rate_hz, first / rate_hz**2
+    return first, first / rate_hz, first / (rate_hz * rate_hz)
 
 
 def _or(value: Optional[float], other: float) -> float:
