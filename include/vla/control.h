@@ -288,13 +288,16 @@ struct Action {
   std::int64_t age = -1;                       // periods since the oldest observation that contributes; -1 where held
   bool limited = false;                        // max_jump or a limit cut it
   std::span<const std::uint8_t> clamped = {};  // 1 for each column that a limit cut; empty where none
+  bool human = false;                          // a person commanded it
+  std::span<const float> policy = {};          // then: what the policy wanted, before any limit; empty without a row
   const Problem* problem = nullptr;            // of `stopped` and `failed`
 };
 
 struct LoopStats {
   std::int64_t actions = 0, held = 0, chunks = 0, stale = 0, failed = 0, limited = 0, refused = 0, missed = 0,
                notes = 0;
-  int delay = -1;  // steps of the slowest of the last 16 inferences; -1 before the first
+  std::int64_t human = 0;  // commanded by a person
+  int delay = -1;          // steps of the slowest of the last 16 inferences; -1 before the first
 };
 
 /// Turns observations into one action per control period. One thread may use it.
@@ -309,8 +312,15 @@ class ChunkLoop {
   void start_at(std::span<const double> values);
   /// Waits for a first chunk. Errors: all that the policy answers.
   void begin(const Observe& observe);
-  /// One control period. `observe` is called only when an observation is wanted.
-  Action step(const Observe& observe) noexcept;
+  /// One control period. `observe` is called only when an observation is wanted. `human`: of the person who drives, one
+  /// number for each action, within the limits; without it, while a person drives, the command is what `late` says.
+  Action step(const Observe& observe, std::span<const float> human = {}) noexcept;
+  /// A person drives from now on. The policy is still asked, and Action::policy is what it wanted. Errors: usage, where
+  /// another person drives.
+  void take_over(const std::string& who);
+  /// The policy drives again, from what it sees then: chunks of the time before are not used, and commands go on from
+  /// the person's last one. Errors: usage, for somebody who does not drive.
+  void give_back(const std::string& who);
   /// Sleeps until the next control period.
   void pace() noexcept;
   /// Whether frames of the last observation are still being read.

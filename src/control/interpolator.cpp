@@ -24,7 +24,7 @@ constexpr double kPowers[3][6][6] = {
      {-6, -3, -0.5, 6, -3, 0.5}},
 };
 
-bool is_finite(double x) { return std::isfinite(x); }
+bool is_number(double x) { return std::isfinite(x); }
 
 }  // namespace
 
@@ -38,7 +38,7 @@ Interpolator::Interpolator(std::vector<Kind> kinds, Method method, double rate_h
 }
 
 void Interpolator::start_at(std::span<const double> values) {
-  if (values.size() != columns_.size() || !std::all_of(values.begin(), values.end(), is_finite))
+  if (values.size() != columns_.size() || !std::all_of(values.begin(), values.end(), is_number))
     throw Error("bad_action", "start_at", fmt::format("{} finite numbers", columns_.size()),
                 fmt::format("{}", values.size()));
   for (std::size_t i = 0; i < columns_.size(); ++i) {
@@ -51,7 +51,7 @@ void Interpolator::start_at(std::span<const double> values) {
 }
 
 bool Interpolator::to(std::span<const float> values) noexcept {
-  if (!has_start_ || values.size() != columns_.size() || !std::all_of(values.begin(), values.end(), is_finite))
+  if (!has_start_ || values.size() != columns_.size() || !std::all_of(values.begin(), values.end(), is_number))
     return false;
   for (std::size_t i = 0; i < columns_.size(); ++i) {
     Motion& column = columns_[i];

@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <time.h>
 
+#include <algorithm>
 #include <cmath>
 
 #include "control/schedule.h"
@@ -30,6 +31,10 @@ bool is_passing(const Problem& problem) {
   for (const char* code : {"busy", "disconnected", "late", "shutting_down", "superseded", "timeout"})
     if (problem.is(code)) return true;
   return false;
+}
+
+bool is_finite(std::span<const float> values) {
+  return std::all_of(values.begin(), values.end(), [](float value) { return std::isfinite(value); });
 }
 
 LoopOptions checked(const Spec& spec, LoopOptions options) {
@@ -77,6 +82,7 @@ struct ChunkLoop::Impl {
   std::optional<double> start;
   std::int64_t tick = -1, n_missed = 0, n_note = 0;
   bool is_waiting = false;
+  std::string driver;  // the person who took over
 
   Impl(Policy& of, const LoopOptions& given)
       : policy(of),
@@ -128,9 +134,15 @@ struct ChunkLoop::Impl {
     return is_passing(last);
   }
 
-  Action step(const Observe& observe) {
+  Action step(const Observe& observe, std::span<const float> human) {
     std::int64_t at = now();
     const auto failed = [&] { return Action{.state = ActionState::failed, .tick = at, .problem = &last}; };
+    if (!human.empty() &&
+        (driver.empty() || human.size() != static_cast<std::size_t>(policy.spec().d_action) || !is_finite(human))) {
+      tell(last, driver.empty() ? "usage" : "bad_action", "human: expected %d finite numbers, of a person who drives",
+           policy.spec().d_action);
+      return failed();
+    }
     if (!collect(at)) return failed();
     if (schedule.wants(at)) {
       submit(observe, at);
@@ -142,7 +154,7 @@ struct ChunkLoop::Impl {
     }
     n_missed += at - tick - 1;
     tick = at;
-    return schedule.next(at);
+    return !driver.empty() && human.empty() ? schedule.hold(at) : schedule.next(at, human);
   }
 };
 
@@ -164,7 +176,25 @@ void ChunkLoop::begin(const Observe& observe) {
   if (loop.last.code[0] != '\0') throw Error(loop.last.code, "begin", "", loop.last.message);
 }
 
-Action ChunkLoop::step(const Observe& observe) noexcept { return impl_->step(observe); }
+Action ChunkLoop::step(const Observe& observe, std::span<const float> human) noexcept {
+  return impl_->step(observe, human);
+}
+
+void ChunkLoop::take_over(const std::string& who) {
+  if (who.empty() || !impl_->driver.empty())
+    throw Error("usage", "take_over", "nobody who drives, and a name", impl_->driver);
+  impl_->driver = who;
+}
+
+void ChunkLoop::give_back(const std::string& who) {
+  Impl& loop = *impl_;
+  if (loop.driver.empty() || loop.driver != who)
+    throw Error("usage", "give_back", who + ", who drives", loop.driver.empty() ? "nobody" : loop.driver);
+  loop.driver.clear();
+  loop.policy.abandon();
+  loop.is_waiting = false;
+  loop.schedule.forget_chunks();
+}
 
 void ChunkLoop::pace() noexcept {
   const Impl& loop = *impl_;
@@ -190,6 +220,7 @@ void ChunkLoop::reset() noexcept {
   loop.start.reset();
   loop.tick = -1, loop.n_missed = loop.n_note = 0;
   loop.last = {};
+  loop.driver.clear();
   loop.schedule.reset();
 }
 

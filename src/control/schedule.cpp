@@ -58,7 +58,7 @@ Schedule::Schedule(Options options) : options_(std::move(options)) {
   for (Source& source : sources_) source.rows.resize(n), source.normalized.resize(n);
   for (std::size_t i = 0; i < most; ++i) order_[i] = i;
   values_.resize(static_cast<std::size_t>(d)), last_.resize(static_cast<std::size_t>(d)),
-      cut_.resize(static_cast<std::size_t>(d));
+      cut_.resize(static_cast<std::size_t>(d)), wanted_.resize(static_cast<std::size_t>(d));
   reset();
 }
 
@@ -141,37 +141,60 @@ bool Schedule::receive(const Answer& answer, std::int64_t tick, Problem& problem
   return true;
 }
 
-Action Schedule::next(std::int64_t tick) noexcept {
+Action Schedule::next(std::int64_t tick, std::span<const float> human) noexcept {
+  Action action = {.tick = tick};
+  if (!may_act(tick, action)) return action;
+  const bool is_human = !human.empty();
+  if (!is_human && n_source_ == 0) return held(tick);
+  action.state = ActionState::command, action.human = is_human;
+  if (n_source_ > 0) {
+    weigh();
+    for (std::size_t i = 0; i < n_source_; ++i)
+      if (weights_[i] > 0 && !source(i).is_held) action.age = std::max(action.age, tick - source(i).tick);
+    mix(is_human ? wanted_ : values_);
+    if (is_human) action.policy = wanted_;
+  }
+  if (is_human) std::copy(human.begin(), human.end(), values_.begin());
+  action.values = values_;
+  limit(action);
+  ++step_, ++(is_human ? counts.human : counts.actions);
+  counts.limited += action.limited;
+  return action;
+}
+
+Action Schedule::hold(std::int64_t tick) noexcept {
+  Action action = {.tick = tick};
+  return may_act(tick, action) ? held(tick) : action;
+}
+
+/// Begins the tick's action. False for a loop that was stopped, or whose limiter does not know where the robot is.
+bool Schedule::may_act(std::int64_t tick, Action& action) noexcept {
   begin(tick);
-  if (is_stopped_) return stopped(tick);
+  action.problem = &stop_;
+  action.state = ActionState::stopped;
+  if (is_stopped_) return false;
+  action.state = ActionState::failed;
   if (options_.limiter != nullptr && !options_.limiter->is_ready()) {
     tell(stop_, "usage", "limits: expected where the robot is: start_at of the loop, found nothing");
-    return {.state = ActionState::failed, .tick = tick, .problem = &stop_};
+    return false;
   }
+  action.problem = nullptr;
   tick_ = tick;
-  if (n_source_ == 0) return hold(tick);
-  weigh();
-  std::int64_t oldest = -1;
-  for (std::size_t i = 0; i < n_source_; ++i) {
-    const Source& each = source(i);
-    if (weights_[i] > 0 && !each.is_held) oldest = std::max(oldest, tick - each.tick);
-  }
-  const auto d = static_cast<std::size_t>(options_.d_action);
-  for (std::size_t column = 0; column < d; ++column) {
+  return true;
+}
+
+/// The weighted sum of the sources' rows for this step.
+void Schedule::mix(std::span<float> row) const noexcept {
+  for (std::size_t column = 0; column < row.size(); ++column) {
     double sum = 0;
     for (std::size_t i = 0; i < n_source_; ++i) {
       if (!(weights_[i] > 0)) continue;
       const Source& each = source(i);
-      const std::size_t row = each.is_held ? 0 : static_cast<std::size_t>(step_ - each.step);
-      sum += weights_[i] * static_cast<double>(each.rows[row * d + column]);
+      const std::size_t at = each.is_held ? 0 : static_cast<std::size_t>(step_ - each.step);
+      sum += weights_[i] * static_cast<double>(each.rows[at * row.size() + column]);
     }
-    values_[column] = static_cast<float>(sum);
+    row[column] = static_cast<float>(sum);
   }
-  Action action = {.state = ActionState::command, .values = values_, .tick = tick, .age = oldest};
-  limit(action);
-  ++step_, ++counts.actions;
-  counts.limited += action.limited;
-  return action;
 }
 
 /// Chunks without a row for now are forgotten; a held command only fades, and is nothing to go on with.
@@ -232,14 +255,14 @@ void Schedule::weigh() noexcept {
   }
 }
 
-Action Schedule::hold(std::int64_t tick) noexcept {
+Action Schedule::held(std::int64_t tick) noexcept {
   ++counts.held;
   if (options_.late == Late::stop && has_last_) {
     tell(stop_, "late",
          "control: expected an action for period %lld, found no chunk that has one; stop the robot; then reset()",
          static_cast<long long>(tick));
     is_stopped_ = true;
-    return stopped(tick);
+    return {.state = ActionState::stopped, .tick = tick, .problem = &stop_};
   }
   if (options_.late != Late::zero && !has_last_) return {.state = ActionState::none, .tick = tick};
   if (options_.late == Late::zero)
@@ -259,7 +282,7 @@ void Schedule::limit(Action& action) noexcept {
     const int n_cut = options_.limiter->step(values_, values_, cut_);
     action.limited = n_cut > 0;
     if (n_cut > 0) action.clamped = cut_;
-  } else if (!options_.max_jump.empty() && has_last_) {
+  } else if (!options_.max_jump.empty() && has_last_ && !action.human) {
     for (std::size_t i = 0; i < values_.size(); ++i) {
       const float most = options_.max_jump[i], cut = std::min(std::max(values_[i], last_[i] - most), last_[i] + most);
       action.limited |= cut != values_[i];
@@ -267,10 +290,6 @@ void Schedule::limit(Action& action) noexcept {
     }
   }
   last_ = values_, has_last_ = true;
-}
-
-Action Schedule::stopped(std::int64_t tick) noexcept {
-  return {.state = ActionState::stopped, .tick = tick, .problem = &stop_};
 }
 
 }  // namespace vla::control

@@ -37,7 +37,12 @@ class Schedule {
   /// False, and `problem`, for a chunk of another shape, with a number that is not finite, or too many of whose rows
   /// break a limit; nothing of it is used. One that came too late is dropped and counted.
   bool receive(const Answer& answer, std::int64_t tick, Problem& problem) noexcept;
-  Action next(std::int64_t tick) noexcept;
+  /// `human`: what a person commands instead; empty for the policy's.
+  Action next(std::int64_t tick, std::span<const float> human) noexcept;
+  /// As `next` where no chunk has a row.
+  Action hold(std::int64_t tick) noexcept;
+  /// Chunks, and the observation under way, are not used any more. The last command stays.
+  void forget_chunks() noexcept { n_source_ = 0, is_flying_ = false; }
 
   /// The next rows of the newest chunk, at most n_row, as its network answered them.
   std::span<const float> leftover(int n_row) const noexcept;
@@ -60,9 +65,10 @@ class Schedule {
   Source& add_source() noexcept;
   int make_fade(std::int64_t tick) noexcept;
   void weigh() noexcept;
-  Action hold(std::int64_t tick) noexcept;
+  Action held(std::int64_t tick) noexcept;
+  bool may_act(std::int64_t tick, Action& action) noexcept;
+  void mix(std::span<float> row) const noexcept;
   void limit(Action& action) noexcept;
-  Action stopped(std::int64_t tick) noexcept;
   const Source& source(std::size_t i) const noexcept { return sources_[order_[i]]; }
 
   Options options_;
@@ -70,7 +76,7 @@ class Schedule {
   std::vector<std::size_t> order_;  // the first n_source_ are in use, the others free
   std::size_t n_source_ = 0;
   std::vector<double> weights_;
-  std::vector<float> values_, last_;
+  std::vector<float> values_, last_, wanted_;
   std::vector<std::uint8_t> cut_;
   bool has_last_ = false, is_flying_ = false, is_warm_ = false, is_stopped_ = false;
   std::int64_t step_ = 0, tick_ = -1, flight_step_ = 0, flight_tick_ = 0;

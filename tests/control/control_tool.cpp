@@ -106,6 +106,7 @@ Json shown(const Action& action) {
     if (action.clamped[i]) clamped.push_back(i);
   Json json = {{"state", kStates[static_cast<int>(action.state)]}, {"values", bits(action.values)}};
   if (action.problem != nullptr) return {{"state", json["state"]}, {"code", action.problem->code}};
+  json.update({{"human", action.human}, {"policy", bits(action.policy)}});
   json.update({{"tick", action.tick}, {"age", action.age}, {"limited", action.limited}, {"clamped", clamped}});
   return json;
 }
@@ -134,15 +135,19 @@ Json run_loop(const Json& scenario) {
       if (options.limits) loop.start_at(start);
       continue;
     }
-    policy.now = std::max(policy.now, time.get<double>());
-    actions.push_back(shown(loop.step([](Observation&) {})));
+    if (time.is_string()) {
+      time == "take over" ? loop.take_over("operator") : loop.give_back("operator");
+      continue;
+    }
+    policy.now = std::max(policy.now, time["at"].get<double>());
+    actions.push_back(shown(loop.step([](Observation&) {}, time["human"].get<std::vector<float>>())));
   }
   const LoopStats stats = loop.stats();
   return {{"actions", actions},
           {"asked", policy.asked},
           {"stats",
            {stats.actions, stats.held, stats.chunks, stats.stale, stats.failed, stats.limited, stats.refused,
-            stats.missed, stats.notes, stats.delay}}};
+            stats.missed, stats.notes, stats.human, stats.delay}}};
 }
 
 Json run_limiter(const Json& scenario) {

@@ -83,7 +83,8 @@ def shown(action):
     values = [] if action.values is None else bits(action.values)
     age = -1 if action.age is None else action.age
     return {
-        "state": state, "values": values, "tick": action.tick, "age": age, "limited": action.limited, "clamped": list(action.clamped)
+        "state": state, "values": values, "tick": action.tick, "age": age, "limited": action.limited, "clamped": list(action.clamped),
+        "human": action.human, "policy": [] if action.policy is None else bits(action.policy),
     }  # fmt: skip
 
 
@@ -105,9 +106,12 @@ def in_python(scenario):
             if limits:
                 loop.start_at(scenario["start"])
             continue
-        policy.now = max(policy.now, time)
+        if isinstance(time, str):
+            loop.take_over("operator") if time == "take over" else loop.give_back("operator")
+            continue
+        policy.now = max(policy.now, time["at"])
         try:
-            actions.append(shown(loop.step({})))
+            actions.append(shown(loop.step({}, human=time["human"] or None)))
         except Late as error:
             actions.append({"state": "stopped", "code": error.code})
         except (BadAction, Noted) as error:
@@ -116,7 +120,7 @@ def in_python(scenario):
             assert getattr(error, "code", "") == "bad_observation", error
             actions.append({"state": "failed", "code": error.code})
     stats = loop.stats
-    names = ("actions", "held", "chunks", "stale", "failed", "limited", "refused", "missed", "notes")
+    names = ("actions", "held", "chunks", "stale", "failed", "limited", "refused", "missed", "notes", "human")
     delay = -1 if stats["delay"] is None else stats["delay"]
     return {"actions": actions, "asked": policy.asked, "stats": [stats[name] for name in names] + [delay]}
 
@@ -149,10 +153,17 @@ def scenario_of(seed):
         seconds = float(rng.choice((0.2, 1.4, 3.0, horizon + 1.0)) / rate)
         return {"seconds": seconds, "rows": rows, "normalized": rows, "notes": int(rng.random() < 0.1), "error": code}
 
-    times, now = [], 100.0
+    times, now, is_driven = [], 100.0, False
     for _ in range(int(rng.integers(10, 60))):
         now += float(rng.choice((1.0, 1.0, 1.0, 0.7, 2.3)) / rate)
-        times.append(None if rng.random() < 0.02 else now)
+        if rng.random() < 0.02:
+            times.append(None)
+            is_driven = False
+        elif rng.random() < 0.07:
+            times.append("give back" if is_driven else "take over")
+            is_driven = not is_driven
+        is_commanded = is_driven and rng.random() < 0.9
+        times.append({"at": now, "human": rng.uniform(-2, 2, d).astype(np.float32).astype(float).tolist() if is_commanded else []})
     options = {
         "rate_hz": rate, "replan_every": int(rng.integers(1, horizon + 1)), "mode": mode, "blend": blend,
         "fade_steps": int(rng.integers(0, 6)), "decay": float(rng.uniform(0, 1)), "late": str(rng.choice(("hold", "zero", "stop"))),
@@ -178,8 +189,9 @@ def test_both_loops_give_the_same_bytes():
             assert one == other, f"scenario {seed}, step {i}"
         assert expected == found, f"scenario {seed}"
         seen |= {action["state"] for action in found["actions"]} | {"clamped" for action in found["actions"] if action.get("clamped")}
+        seen |= {"human" for action in found["actions"] if action.get("human") and action["policy"]}
         seen |= {"leftover" for asked in found["asked"] if asked}
-    assert seen == {"command", "held", "none", "stopped", "failed", "clamped", "leftover"}  # the scenarios reach every state
+    assert seen == {"command", "held", "none", "stopped", "failed", "clamped", "leftover", "human"}  # the scenarios reach every state
 
 
 # --- its parts ------------------------------------------------------------------------------------------------------------------

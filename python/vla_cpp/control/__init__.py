@@ -3,9 +3,10 @@
 """Running action chunks on a robot: when to ask, which row to command, what to do when the answer is late (docs/control.md)."""
 
 from .blend import Blend, CrossFade, Ensemble
+from .episodes import Episode, EpisodeWriter
 from .interpolate import Interpolator
 from .limits import Column, Limiter, Limits
 from .loop import ChunkLoop, RealTimeChunking
 from .schedule import Action, ChunkSchedule
 
-__all__ = ["Action", "Blend", "ChunkLoop", "ChunkSchedule", "Column", "CrossFade", "Ensemble", "Interpolator", "Limiter", "Limits", "RealTimeChunking"]
+__all__ = ["Action", "Blend", "ChunkLoop", "ChunkSchedule", "Column", "CrossFade", "Ensemble", "Episode", "EpisodeWriter", "Interpolator", "Limiter", "Limits", "RealTimeChunking"]

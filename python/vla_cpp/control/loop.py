@@ -140,6 +140,7 @@ class ChunkLoop:
         self._forget()
 
     def _forget(self) -> None:
+        self.driver: Optional[str] = None  # the person who took over
         self._start: Optional[float] = None
         self._tick = -1
         self._missed = self._notes = 0
@@ -155,12 +156,32 @@ class ChunkLoop:
             raise UsageError("start_at", "a loop with limits", "none")
         self._limiter.rest_at(values)
 
-    def step(self, observation: Observation) -> Action:
+    def take_over(self, who: str) -> None:
+        """A person drives from now on: `step` takes their commands, in `human`. The policy is still asked, and `Action.policy` is what it
+        wanted. Errors: UsageError where another person drives."""
+        if self.driver is not None:
+            raise UsageError("take_over", "nobody who drives", self.driver)
+        self.driver = who
+
+    def give_back(self, who: str) -> None:
+        """The policy drives again, from what it sees then: chunks of the time before are not used, and commands go on from the person's
+        last one, as `on_late` and `blend` say. Errors: UsageError for somebody who does not drive."""
+        if self.driver != who:
+            raise UsageError("give_back", f"{who}, who drives", str(self.driver or "nobody"))
+        self.driver = None
+        self._handle = None
+        self.schedule.forget_chunks()
+
+    def step(self, observation: Observation, human: Any = None) -> Action:
         """One control period.
 
         observation  the arguments of `policy.act`, or a function that returns them, called only when an observation is wanted:
                      cameras need not be read for a period that does not look at them
+        human        of the person who drives: one number for each action, within the limits. Without it, while a person drives, the command
+                     is what `on_late` says
         """
+        if human is not None and self.driver is None:
+            raise UsageError("human", "a person who drives: take_over", "nobody")
         tick = self._now()
         self._collect(tick)
         if self.schedule.wants(tick):
@@ -171,7 +192,9 @@ class ChunkLoop:
                 self._collect(tick)
         self._missed += tick - self._tick - 1
         self._tick = tick
-        return self.schedule.next(tick)
+        if self.driver is not None and human is None:
+            return self.schedule.hold(tick)
+        return self.schedule.next(tick, human)
 
     def begin(self, observation: Observation) -> None:
         """Waits for a first chunk, so that the first `step` has an action. Errors: all that `policy.act` raises."""
@@ -192,7 +215,7 @@ class ChunkLoop:
     @property
     def stats(self) -> Dict[str, Any]:
         """Counts since the start: actions, held, chunks, stale (dropped for their age), failed (in all, and by the error's code),
-        limited, refused, missed (periods without a call of `step`), notes; and the delay in steps."""
+        limited, refused, human (commanded by a person), missed (periods without a call of `step`), notes; and the delay in steps."""
         own = {"missed": self._missed, "notes": self._notes, "delay": self.schedule.delay}
         return {**self.schedule.counts, **self._errors, **own}
 

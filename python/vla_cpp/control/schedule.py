@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import BadAction, Late, UsageError
 from .blend import Blend, Source
-from .limits import Limiter
+from .limits import Limiter, finite_row
 
 OnLate = Callable[[Optional[np.ndarray], int], Optional[np.ndarray]]
 N_DELAY = 16  # inferences that an estimate of the delay looks back on
@@ -35,6 +35,8 @@ class Action:
     chunk    the newest contributing chunk, as it was received; None where held
     limited  `max_jump` or a limit cut it
     clamped  the columns that a limit cut
+    human    a person commanded it (`take_over`)
+    policy   what the policy wanted then, before any limit; None where no chunk had a row
     """
 
     values: Optional[np.ndarray]
@@ -45,6 +47,8 @@ class Action:
     chunk: Any = None
     limited: bool = False
     clamped: Tuple[int, ...] = ()
+    human: bool = False
+    policy: Optional[np.ndarray] = None
 
 
 class Flight(NamedTuple):
@@ -95,7 +99,7 @@ class ChunkSchedule:
     def reset(self) -> None:
         """Forgets everything, as before the first call: an episode begins."""
         self.step = 0
-        counts = ("actions", "held", "chunks", "stale", "failed", "limited", "refused")
+        counts = ("actions", "held", "chunks", "stale", "failed", "limited", "refused", "human")
         self.counts: Dict[str, int] = dict.fromkeys(counts, 0)
         if self._limiter:
             self._limiter.reset()
@@ -165,32 +169,47 @@ class ChunkSchedule:
         self._sources.append(Source(flight.step, flight.tick, rows, self.step, fade, chunk))
         return True
 
-    def next(self, tick: int) -> Action:
+    def next(self, tick: int, human: Any = None) -> Action:
         """What to command in this control period, which ends with it: the next tick must be a later one.
 
-        Errors: what `on_late` raises, then and from then on: a loop that was stopped goes on after `reset` only.
+        human  what a person commands instead, one number for each action. Limits hold for it too
+
+        Errors: what `on_late` raises, then and from then on: a loop that was stopped goes on after `reset` only. BadAction for a
+        command of a person that is not finite.
         """
         self._begin(tick)
         if self._end:
             raise self._end
+        if human is not None:
+            human = finite_row("human", human, self.d_action).astype(np.float32)
         self._tick = tick
-        if not self._sources:
-            try:
-                return self._hold(tick)
-            except Exception as error:
-                self._end = error
-                raise
-        weights = self._blend.weights(self._sources, self.step)
+        if human is None and not self._sources:
+            return self._hold(tick)
+        weights = self._blend.weights(self._sources, self.step) if self._sources else ()
         parts = [(w, s) for w, s in zip(weights, self._sources) if w > 0]
-        values = sum(w * s.row(self.step).astype(np.float64) for w, s in parts).astype(np.float32)
-        values, limited, clamped = self._limit(values)
+        wanted = sum(w * s.row(self.step).astype(np.float64) for w, s in parts).astype(np.float32) if parts else None
+        is_human = human is not None
+        values, limited, clamped = self._limit(human if is_human else wanted, is_human)
         self._last = values
         self.step += 1
-        self.counts["actions"] += 1
+        self.counts["human" if is_human else "actions"] += 1
         self.counts["limited"] += limited
         ages = [tick - s.tick for _, s in parts if s.tick is not None]
         sources = tuple((s.tick, float(w)) for w, s in parts)
-        return Action(values.copy(), tick, False, max(ages), sources, parts[-1][1].chunk, limited, clamped)
+        chunk = parts[-1][1].chunk if parts else None
+        return Action(values.copy(), tick, False, max(ages, default=None), sources, chunk, limited, clamped, is_human, wanted if is_human else None)
+
+    def hold(self, tick: int) -> Action:
+        """As `next` where no chunk has a row."""
+        self._begin(tick)
+        if self._end:
+            raise self._end
+        self._tick = tick
+        return self._hold(tick)
+
+    def forget_chunks(self) -> None:
+        """Chunks, and the observation under way, are not used any more. The last command stays, and what comes next fades from it."""
+        self._sources, self._flight = [], None
 
     # --- inside ----------------------------------------------------------------------------------------------------------------
 
@@ -221,11 +240,8 @@ class ChunkSchedule:
 
     def _hold(self, tick: int) -> Action:
         self.counts["held"] += 1
-        values = self._on_late(None if self._last is None else self._last.copy(), tick)
+        values = self._late_values(tick)
         if values is not None:
-            values = np.array(values, np.float32)
-            if values.shape != (self.d_action,) or not np.isfinite(values).all():
-                raise BadAction("on_late", f"{self.d_action} finite numbers", str(values))
             clamped: Tuple[int, ...] = ()
             if self._limiter:
                 values, _, clamped = self._limit(values)
@@ -233,11 +249,24 @@ class ChunkSchedule:
             return Action(values.copy(), tick, True, limited=bool(clamped), clamped=clamped)
         return Action(None, tick, True)
 
-    def _limit(self, values: np.ndarray) -> Tuple[np.ndarray, bool, Tuple[int, ...]]:
+    def _late_values(self, tick: int) -> Optional[np.ndarray]:
+        try:
+            values = self._on_late(None if self._last is None else self._last.copy(), tick)
+            if values is None:
+                return None
+            values = np.array(values, np.float32)
+            if values.shape != (self.d_action,) or not np.isfinite(values).all():
+                raise BadAction("on_late", f"{self.d_action} finite numbers", str(values))
+            return values
+        except Exception as error:
+            self._end = error
+            raise
+
+    def _limit(self, values: np.ndarray, is_human: bool = False) -> Tuple[np.ndarray, bool, Tuple[int, ...]]:
         if self._limiter:
             values, is_cut = self._limiter.step(values)
             return values, bool(is_cut.any()), tuple(int(i) for i in np.flatnonzero(is_cut))
-        if self._max_jump is None or self._last is None:
+        if self._max_jump is None or self._last is None or is_human:
             return values, False, ()
         cut = np.clip(values, self._last - self._max_jump, self._last + self._max_jump)
         return cut, bool((cut != values).any()), ()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""vla-export: a recording of `vla serve --record` as a file that other programs open."""
+"""vla-export: a recording of `vla serve --record`, or the episodes of a control loop, as files that other programs open."""
 
 from __future__ import annotations
 
@@ -18,17 +18,19 @@ from ..output import is_special, whole_file
 EPILOG = """examples:
   vla-export recording --mcap out.mcap
   vla-export recording --lerobot dataset --fps 10
+  vla-export episodes --lerobot corrections --only-interventions
 Exit codes: 0 done, 2 usage, 9 a file or a package, 11 a damaged recording."""
 CODES = {"usage": 2, "io": 9, "bad_request": 11, "bad_observation": 11, "bad_action": 11}
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("vla-export", description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recording", type=Path, help="folder of vla serve --record")
+    parser.add_argument("recording", type=Path, help="folder of vla serve --record, or of vla_cpp.control.EpisodeWriter")
     parser.add_argument("--mcap", type=Path, metavar="FILE", help="for Foxglove, Lichtblick and what else reads MCAP")
     parser.add_argument("--rrd", type=Path, metavar="FILE", help="for Rerun's viewer")
-    parser.add_argument("--lerobot", type=Path, metavar="DIR", help="a LeRobot data set: a frame for each chunk, its first row as the action")
-    parser.add_argument("--fps", type=int, metavar="N", help="of the LeRobot data set: how many acts a second were asked for")
+    parser.add_argument("--lerobot", type=Path, metavar="DIR", help="a LeRobot data set. Of a recording: a frame for each chunk, its first row as the action. Of episodes: a frame for each control period, with what the policy wanted and whether a person drove")
+    parser.add_argument("--only-interventions", action="store_true", help="of episodes: only what a person commanded")
+    parser.add_argument("--fps", type=int, metavar="N", help="of a recording's LeRobot data set: how many acts a second were asked for")
     parser.add_argument("--gap", type=float, default=2.0, metavar="S", help="of the LeRobot data set: an episode ends where no act came for so many seconds, or the instruction changed (default 2)")
     parser.add_argument("--client", type=int, action="append", default=[], metavar="N", help="only acts of this connection, counted from 1 in the order of their first acts; may be given again. Required where there are several")
     parser.add_argument("--first", type=int, metavar="N", help="only so many records")
@@ -67,11 +69,13 @@ class _Acts:
 def export(a: argparse.Namespace) -> None:
     if not (a.mcap or a.rrd or a.lerobot):
         raise UsageError("vla-export", "--mcap, --rrd or --lerobot")
+    if any(a.recording.glob("episode_*")):
+        return export_episodes(a)
+    if a.only_interventions:
+        raise UsageError("--only-interventions", "episodes of a control loop", f"{a.recording}, which has none")
     if (a.lerobot is None) != (a.fps is None) or (a.fps is not None and a.fps < 1) or not a.gap > 0:
         raise UsageError("--lerobot", "--fps above 0 with it, and only with it", "", "--gap is above 0 too")
-    for path in filter(None, (a.mcap, a.rrd, a.lerobot)):
-        if path.exists() and not is_special(path):
-            raise IoError(str(path), "a name that is free", "a file or folder")
+    _check_free(a.mcap, a.rrd, a.lerobot)
     acts = _Acts(a)
     if not acts.is_whole:
         print("vla-export: the recording has no end: its server was killed, or --first took a part", file=sys.stderr)
@@ -86,8 +90,31 @@ def export(a: argparse.Namespace) -> None:
     if a.lerobot:
         from .lerobot_dataset import write_lerobot
 
-        counts = _folder(a.lerobot, lambda part: write_lerobot(part, acts, a.fps, a.gap))
-        print(f"{counts['frames']} frames in {counts['episodes']} episodes")
+        _tell(_folder(a.lerobot, lambda part: write_lerobot(part, acts, a.fps, a.gap)))
+
+
+def export_episodes(a: argparse.Namespace) -> None:
+    if not a.lerobot or a.mcap or a.rrd or a.fps or a.client or a.first:
+        raise UsageError("vla-export", "--lerobot alone for episodes, whose rate they know", "another option")
+    _check_free(a.lerobot)
+    from ..control.episodes import episodes_of
+    from .lerobot_dataset import write_episodes
+
+    episodes = episodes_of(a.recording)
+    for episode in episodes:
+        if episode.is_cut:
+            print(f"vla-export: {episode.folder} ends within a frame: its writer was killed", file=sys.stderr)
+    _tell(_folder(a.lerobot, lambda part: write_episodes(part, episodes, a.only_interventions)))
+
+
+def _check_free(*paths: Optional[Path]) -> None:
+    for path in filter(None, paths):
+        if path.exists() and not is_special(path):
+            raise IoError(str(path), "a name that is free", "a file or folder")
+
+
+def _tell(counts: Dict[str, int]) -> None:
+    print(f"{counts['frames']} frames in {counts['episodes']} episodes")
 
 
 def _file(path: Path, write: Any) -> None:

@@ -1,15 +1,17 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A LeRobot data set, written by LeRobot itself: a frame for each chunk, with the chunk's first row as its action."""
+"""LeRobot data sets, written by LeRobot itself: of a server's recording a frame for each chunk, with the chunk's first row as its action;
+of a loop's episodes a frame for each control period, with what was commanded."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Dict, Iterable, Iterator, List, Optional
+from typing import Any, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple
 
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from ..control.episodes import Episode, Header
 from ..errors import BadRequest, UsageError, VlaError
 from ..recording import RecordedAct
 from .common import column_names, pixels
@@ -37,6 +39,70 @@ def write_lerobot(folder: Path, acts: Iterable[RecordedAct], fps: int, gap_s: fl
         if data is not None:
             data.finalize()
     return {"frames": len(starts), "episodes": sum(starts)}
+
+
+def write_episodes(folder: Path, episodes: Sequence[Episode], only_human: bool) -> Dict[str, int]:
+    """Frames and episodes that were written. Periods without a command are left out; with `only_human` each time that a person drove is
+    an episode. Beside what the policies of LeRobot read, a frame has `action.policy` (NaN where it wanted nothing), `intervention`, and
+    `next.success`, true in the last frame of an episode that somebody called a success.
+
+    Errors: UsageError (nothing to write), BadRequest (an episode of another rate, or with other features than the first).
+    """
+    data: Optional[LeRobotDataset] = None
+    n_frame = n_episode = 0
+    first = episodes[0].header
+    fps = round(first.rate_hz)
+    if fps != first.rate_hz:
+        raise UsageError("--lerobot", "a whole number of control periods a second, as LeRobot counts", f"{first.rate_hz:g}")
+    try:
+        for episode in episodes:
+            if _shape_of(episode.header) != _shape_of(first):
+                raise BadRequest(str(episode.folder), f"rate, views, states and actions of {episodes[0].folder}", str(_shape_of(episode.header)))
+            kept = [_is_kept(frame, only_human) for frame in episode]
+            for i, frame in enumerate(episode):
+                if not kept[i]:
+                    continue
+                if data is None:
+                    data = LeRobotDataset.create(folder.name, fps, _features_of(first), root=folder, use_videos=False)
+                is_success = bool(episode.header.success) and i == len(kept) - 1
+                data.add_frame({**_frame_of(episode, frame), "next.success": np.array([is_success]), "task": episode.header.text})
+                n_frame += 1
+                if i == len(kept) - 1 or not kept[i + 1]:
+                    data.save_episode()
+                    n_episode += 1
+    finally:
+        if data is not None:
+            data.finalize()
+    if data is None:
+        raise UsageError("--lerobot", "commands of a person" if only_human else "commands")
+    return {"frames": n_frame, "episodes": n_episode}
+
+
+def _shape_of(header: Header) -> Tuple[Any, ...]:
+    return header.rate_hz, dict(header.images), dict(header.states), header.action_names
+
+
+def _is_kept(frame: np.void, only_human: bool) -> bool:
+    return not np.isnan(frame["action"]).any() and (bool(frame["human"]) or not only_human)
+
+
+def _features_of(header: Header) -> Dict[str, Any]:
+    names, flag = list(header.action_names), {"dtype": "bool", "shape": (1,), "names": None}
+    action = {"dtype": "float32", "shape": (len(names),), "names": names}
+    found = {name: {"dtype": "image", "shape": (*size, 3), "names": ["height", "width", "channels"]} for name, size in header.images.items()}
+    found.update({name: {"dtype": "float32", "shape": (len(n),), "names": list(n)} for name, n in header.states.items()})
+    return {**found, "action": action, "action.policy": action, "intervention": flag, "next.success": flag}
+
+
+def _frame_of(episode: Episode, frame: np.void) -> Dict[str, Any]:
+    header = episode.header
+    return {
+        **{name: frame[f"image {name}"] for name in header.images},
+        **{name: frame[f"state {name}"] for name in header.states},
+        "action": frame["action"],
+        "action.policy": frame["policy"],
+        "intervention": np.array([frame["human"]]),
+    }
 
 
 def _answered(acts: Iterable[RecordedAct]) -> Iterator[RecordedAct]:
