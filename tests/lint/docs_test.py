@@ -23,6 +23,7 @@ PROGRAMS = {  # program -> files in whose text its flags are written
     "vla-convert": ("python/vla_cpp/**/*.py",),
     "vla-pull": ("python/vla_cpp/pull.py",),
     "vla-export": ("python/vla_cpp/export/*.py",),
+    "vla-limits": ("python/vla_cpp/control/suggest.py",),
 }
 ANY_OF_OURS = ("src/cli/*.cpp", "python/**/*.py", "scripts/*", "scripts/gpu_kit/*.py", "tools/**/*.py", "examples/**/*.py", "tests/lint/*.py")
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w-]*")
