@@ -4,8 +4,9 @@
 // Running a policy's chunks on a robot from C++20: a client of `vla serve`, and the loop that decides which row of
 // which chunk is commanded in each control period. docs/control.md explains both, and the same classes of Python.
 //
-// What is set up throws vla::control::Error. What runs in a control period (`ChunkLoop::step`, `Limiter::step`,
-// `Interpolator::to` and `at`) is noexcept, takes no lock, allocates nothing and never waits, but for Mode::sync.
+// Constructors and set-up functions throw vla::control::Error. The functions of a control period (`ChunkLoop::step`,
+// `Limiter::step`, `Interpolator::to` and `at`) are noexcept, take no lock, allocate nothing and never wait, except
+// that `step` waits for the chunk with Mode::sync.
 #pragma once
 
 #include <cstddef>
@@ -21,14 +22,14 @@
 
 namespace vla::control {
 
-/// What cannot be set up. `code` is a name of docs/protocol.md, or "timeout" or "disconnected".
+/// Thrown during set-up. `code` is a name of docs/protocol.md, or "timeout" or "disconnected".
 struct Error : std::runtime_error {
   Error(std::string code, const std::string& where, const std::string& expected, const std::string& found,
         const std::string& hint = "");
   std::string code;
 };
 
-/// What went wrong while the robot runs; a text in memory of its own.
+/// A problem while the robot runs. Its text has a fixed size, so that telling it allocates nothing.
 struct Problem {
   char code[24] = "";  // empty: nothing
   char message[400] = "";
@@ -68,7 +69,7 @@ struct StateVector {
   std::vector<float> values = {};  // world units
 };
 
-/// What a policy is asked with. An Observation is filled again and again; vectors that keep their sizes allocate
+/// The inputs of a policy. The loop fills one Observation again and again; vectors that keep their sizes allocate
 /// nothing.
 struct Observation {
   std::vector<Frame> frames = {};
@@ -176,13 +177,13 @@ class Limiter {
   /// outside of its limits.
   void rest_at(std::span<const double> values);
   void reset() noexcept;
-  bool is_ready() const noexcept;  // no position is unknown
+  bool is_ready() const noexcept;  // every position is known
   /// The command for `wanted`, which is finite, into `out`; `cut` becomes 1 for columns that differ. Returns how many
   /// do. Before rest_at of positions it commands nothing and returns -1.
   int step(std::span<const float> wanted, std::span<float> out, std::span<std::uint8_t> cut) noexcept;
   /// How many of the rows of a chunk break a limit by themselves or together with the rows before; `first`: the first
   /// of them.
-  int breaks(std::span<const float> rows, int& first) const noexcept;
+  int breaks(std::span<const float> rows, int& first) noexcept;
   double refuse_above() const noexcept { return refuse_above_; }
 
  private:
@@ -191,6 +192,7 @@ class Limiter {
     bool is_place = false;
     double low = 0, high = 0, slowest = 0, fastest = 0, acceleration = 0, jerk = 0;  // per step
     double place = 0, velocity = 0, change = 0;
+    double rounding = 0;              // of a chunk's values and their differences, which are float32
     std::vector<double> stop, tried;  // accelerations of a stop
     std::size_t stop_at = 0, stop_size = 0;
   };
@@ -273,8 +275,8 @@ struct LoopOptions {
   std::vector<float> max_jump = {};    // one number, or one per column; empty: any
   std::optional<Limits> limits = {};   // in any order
   bool allow_other_rate = false;
-  std::function<double()> clock = {};      // seconds; empty: CLOCK_MONOTONIC
-  std::function<void(double)> sleep = {};  // of pace(); empty: clock_nanosleep
+  std::function<double()> clock = {};      // seconds; empty: steady_clock
+  std::function<void(double)> sleep = {};  // of pace(); empty: sleep_for
 };
 
 /// command: a row of a chunk. held: what `late` says. none: nothing to command. stopped: Late::stop, until reset.

@@ -186,19 +186,19 @@ int Limiter::step(std::span<const float> wanted, std::span<float> out, std::span
   return n_cut;
 }
 
-int Limiter::breaks(std::span<const float> rows, int& first) const noexcept {
+int Limiter::breaks(std::span<const float> rows, int& first) noexcept {
   const std::size_t d = motions_.size(), n_row = rows.size() / d;
   int n_broken = 0;
   first = -1;
   const auto value = [&](std::size_t row, std::size_t i) { return static_cast<double>(rows[row * d + i]); };
-  const auto slack = [&](std::size_t i) {  // rows are float32, and so are differences of them
+  for (std::size_t i = 0; i < d; ++i) {
     double most = 0;
     for (std::size_t row = 0; row < n_row; ++row) most = std::max(most, std::abs(value(row, i)));
-    return 8 * static_cast<double>(std::numeric_limits<float>::epsilon()) * most;
-  };
+    motions_[i].rounding = 8 * static_cast<double>(std::numeric_limits<float>::epsilon()) * most;
+  }
   const auto is_broken = [&](std::size_t row, std::size_t i) {
     const Motion& m = motions_[i];
-    const double rounding = slack(i);
+    const double rounding = m.rounding;
     const auto velocity = [&](std::size_t r) {
       return !m.is_place ? value(r, i) : r == 0 ? 0 : value(r, i) - value(r - 1, i);
     };

@@ -3,28 +3,21 @@
 //
 // As python/vla_cpp/control/loop.py: asks a policy, keeps the time.
 #include <fmt/format.h>
-#include <time.h>
 
 #include <algorithm>
+#include <chrono>
 #include <cmath>
+#include <thread>
 
+#include "base/clock.h"
 #include "control/schedule.h"
 
 namespace vla::control {
 namespace {
 
-double monotonic_seconds() {
-  timespec now = {};
-  clock_gettime(CLOCK_MONOTONIC, &now);
-  return static_cast<double>(now.tv_sec) + 1e-9 * static_cast<double>(now.tv_nsec);
-}
+double monotonic_seconds() { return std::chrono::duration<double>(Clock::now().time_since_epoch()).count(); }
 
-void sleep_seconds(double seconds) {
-  if (!(seconds > 0)) return;
-  timespec time = {.tv_sec = static_cast<time_t>(seconds), .tv_nsec = 0};
-  time.tv_nsec = static_cast<long>(1e9 * (seconds - static_cast<double>(time.tv_sec)));
-  clock_nanosleep(CLOCK_MONOTONIC, 0, &time, nullptr);
-}
+void sleep_seconds(double seconds) { std::this_thread::sleep_for(std::chrono::duration<double>(seconds)); }
 
 /// Problems that another observation may survive. All others would come again.
 bool is_passing(const Problem& problem) {

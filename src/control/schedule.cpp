@@ -50,8 +50,8 @@ Schedule::Schedule(Options options) : options_(std::move(options)) {
     throw Error("usage", "max_jump", fmt::format("a number above 0, or {} of them", d),
                 fmt::format("{} numbers", jump.size()));
   if (jump.size() == 1) jump.resize(static_cast<std::size_t>(d), jump[0]);
-  // A chunk is taken for each step at most and serves `horizon` of them; beside them there is a held command, and the
-  // new one.
+  // At most one chunk arrives per step, and each serves `horizon` steps. Two more: a held command, and the chunk that
+  // arrives.
   const std::size_t most = static_cast<std::size_t>(horizon) + 3,
                     n = static_cast<std::size_t>(horizon) * static_cast<std::size_t>(d);
   sources_.resize(most), order_.resize(most), weights_.resize(most);
@@ -67,7 +67,7 @@ void Schedule::reset() noexcept {
   if (options_.limiter != nullptr) options_.limiter->reset();
   n_source_ = 0;
   has_last_ = is_flying_ = is_stopped_ = false;
-  step_ = 0, tick_ = -1, n_delay_ = 0;
+  step_ = 0, n_delay_ = 0;
 }
 
 int Schedule::delay() const noexcept {
@@ -179,7 +179,6 @@ bool Schedule::may_act(std::int64_t tick, Action& action) noexcept {
     return false;
   }
   action.problem = nullptr;
-  tick_ = tick;
   return true;
 }
 

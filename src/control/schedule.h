@@ -79,7 +79,7 @@ class Schedule {
   std::vector<float> values_, last_, wanted_;
   std::vector<std::uint8_t> cut_;
   bool has_last_ = false, is_flying_ = false, is_warm_ = false, is_stopped_ = false;
-  std::int64_t step_ = 0, tick_ = -1, flight_step_ = 0, flight_tick_ = 0;
+  std::int64_t step_ = 0, flight_step_ = 0, flight_tick_ = 0;
   std::array<int, kDelays> delays_ = {};
   std::int64_t n_delay_ = 0;
   Problem stop_;

@@ -28,7 +28,7 @@ def spec(monkeypatch):
 
     def of(names, units=(), stats=None):
         told = type(SPEC)(**{**vars(SPEC), "action_names": names, "action_units": units or ("",) * len(names), "d_action": len(names), "bundle": BundleInfo("b", "", "", "")})
-        monkeypatch.setattr(suggest, "bundle_of", lambda path: (told, stats or {}, 20.0))
+        monkeypatch.setattr(suggest, "bundle_of", lambda path: (told, stats or {}))
         return told
 
     return of

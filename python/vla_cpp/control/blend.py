@@ -94,6 +94,6 @@ class Ensemble(Blend):
             raise UsageError("decay", "a finite number, 0 or more", str(self.decay))
 
     def weights(self, sources: Sequence[Source], step: int) -> np.ndarray:
-        # Of the C library and summed in order, as the loop in C++ does it: numpy's own differ in the last bit.
+        # math.exp and a sum in order give the bits of the loop in C++; numpy's exp and sum differ in the last one.
         weights = np.array([math.exp(-self.decay * i) for i in range(len(sources))])
         return weights / np.cumsum(weights)[-1]

@@ -29,7 +29,7 @@ from typing import Any, BinaryIO, Dict, Iterator, List, Mapping, Optional, Tuple
 import numpy as np
 
 from ..errors import BadObservation, BadRequest, IoError, UsageError
-from ..export.common import pixels
+from ..export.common import column_names, pixels
 from ..observation import image_arg, place, states_of
 from ..output import write_text
 from ..spec import Spec
@@ -193,9 +193,9 @@ class EpisodeWriter:
         names = {state.name: tuple(state.names) for state in self._spec.states}
         self._header = Header(
             text=self._text or "", rate_hz=self._rate_hz, bundle=self._spec.bundle.name, checksum=self._spec.bundle.checksum,
-            action_names=_names(self._spec.action_names, self._spec.d_action),
+            action_names=tuple(column_names(self._spec.action_names, self._spec.d_action)),
             images={name: (int(image.shape[0]), int(image.shape[1])) for name, image in images.items()},
-            states={name: _names(names.get(name, ()), len(values)) for name, values in states.items()},
+            states={name: tuple(column_names(names.get(name, ()), len(values))) for name, values in states.items()},
         )  # fmt: skip
         try:
             write_header(self._at, self._header)
@@ -238,10 +238,6 @@ def _policy_of(action: Action) -> Any:
     return math.nan if action.values is None or action.held else action.values
 
 
-def _names(names: Tuple[str, ...], n: int) -> Tuple[str, ...]:
-    return tuple(names) if len(set(names)) == len(names) == n and all(names) else tuple(map(str, range(n)))
-
-
 def _read_header(path: Path) -> Header:
     try:
         if not path.is_file() or os.path.getsize(path) > MAX_HEADER:
@@ -249,8 +245,7 @@ def _read_header(path: Path) -> Header:
         document: Dict[str, Any] = json.loads(path.read_text("utf-8"), parse_constant=no_constant, object_pairs_hook=unique_names)
         if document.pop("format", None) != FORMAT:
             raise ValueError(f'a format that is not "{FORMAT}"')
-        header = Header(**document)
-        return _checked(header)
+        return _checked(Header(**document))
     except (OSError, ValueError, TypeError, AttributeError, RecursionError) as problem:
         raise BadRequest(str(path), "the header of an episode", str(problem)) from None
 

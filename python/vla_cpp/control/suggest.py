@@ -53,8 +53,8 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def bundle_of(path: Path) -> Tuple[Spec, Dict[str, List[float]], float]:
-    """What the runtime says of a bundle: its actions, the statistics of its training data, and its rate."""
+def bundle_of(path: Path) -> Tuple[Spec, Dict[str, List[float]]]:
+    """What the runtime says of a bundle: its actions and rate, and the statistics of its training data."""
     program = next((each for each in candidates() if each.is_file()), None)
     if program is None:
         raise IoError("vla", " or ".join(map(str, candidates())), "no such file")
@@ -68,7 +68,7 @@ def bundle_of(path: Path) -> Tuple[Spec, Dict[str, List[float]], float]:
         views=(), min_views=0, states=(), action_names=names, action_units=units, horizon=0, d_action=len(names), d_noise=0, noise_rows=0,
         noise="", rate_hz=float(keys.get("action.rate_hz", 0)), bundle=BundleInfo(path.name, "", "", ""), precision="", kernels="", device="",
     )  # fmt: skip
-    return spec, told["stats"], spec.rate_hz
+    return spec, told["stats"]
 
 
 def kinds_of(given: Sequence[str], spec: Spec) -> Dict[str, str]:
@@ -163,7 +163,7 @@ def of_statistics(stats: Mapping[str, Sequence[float]], spec: Spec, kinds: Mappi
 
 
 def suggest(a: argparse.Namespace) -> None:
-    spec, stats, _ = bundle_of(a.bundle)
+    spec, stats = bundle_of(a.bundle)
     if not spec.action_names or not all(spec.action_names):
         raise UsageError(str(a.bundle), "a policy whose actions have names", "one without", "vla-convert --action-names gives them")
     kinds = kinds_of(a.kind, spec)

@@ -24,7 +24,7 @@ MAX_ELEMENTS = 1 << 34
 
 
 class Stored(NamedTuple):
-    """An array of the checkpoint. `read` gives all of it, or of its first dimension an index or a slice, as float32."""
+    """An array of the checkpoint. `read` gives all of it, or what an index, a slice or a tuple of indices selects, as float32."""
 
     shape: Tuple[int, ...]
     dtype: str

@@ -5,6 +5,7 @@ of a loop's episodes a frame for each control period, with what was commanded.""
 
 from __future__ import annotations
 
+from itertools import tee, zip_longest
 from pathlib import Path
 from typing import Any, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple
 
@@ -58,16 +59,17 @@ def write_episodes(folder: Path, episodes: Sequence[Episode], only_human: bool) 
         for episode in episodes:
             if _shape_of(episode.header) != _shape_of(first):
                 raise BadRequest(str(episode.folder), f"rate, views, states and actions of {episodes[0].folder}", str(_shape_of(episode.header)))
-            kept = [_is_kept(frame, only_human) for frame in episode]
-            for i, frame in enumerate(episode):
-                if not kept[i]:
+            frames, following = tee(episode)
+            next(following, None)
+            for frame, after in zip_longest(frames, following):  # `after` is None at the end
+                if not _is_kept(frame, only_human):
                     continue
                 if data is None:
                     data = LeRobotDataset.create(folder.name, fps, _features_of(first), root=folder, use_videos=False)
-                is_success = bool(episode.header.success) and i == len(kept) - 1
+                is_success = bool(episode.header.success) and after is None
                 data.add_frame({**_frame_of(episode, frame), "next.success": np.array([is_success]), "task": episode.header.text})
                 n_frame += 1
-                if i == len(kept) - 1 or not kept[i + 1]:
+                if after is None or not _is_kept(after, only_human):
                     data.save_episode()
                     n_episode += 1
     finally:

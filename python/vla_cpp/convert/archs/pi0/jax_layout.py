@@ -181,18 +181,11 @@ def _factors(reader: Reader, name: str, which: str) -> List[Stored]:
     return [left, right]
 
 
-def _at(array: Stored, place: Tuple[int, ...]) -> np.ndarray:
-    x = array.read(place[0])
-    for index in place[1:]:
-        x = x[index]
-    return x
-
-
 def _product(reader: Reader, name: str, array: Stored, factors: List[Stored], place: Tuple[int, ...], axes: Axes, sum_heads: bool = False) -> None:
     def load() -> np.ndarray:
-        x = _at(array, place)
+        x = array.read(place)
         if factors:
-            left, right = (_at(factor, place).astype(np.float64) for factor in factors)
+            left, right = (factor.read(place).astype(np.float64) for factor in factors)
             x = (x + left @ (right.sum(axis=0) if sum_heads else right)).astype(np.float32)
         return axes.turn(x)
 
