@@ -121,18 +121,22 @@ def test_a_killed_writer_leaves_whole_frames(tmp_path):
     assert cut.is_cut and cut.n_frame == 20
 
 
-def test_a_full_disk_is_told(tmp_path):
+def test_a_full_disk_is_told_and_the_next_episode_is_written(tmp_path):
     """A limit on the size of files stands for it; the frames before stay."""
     program = (
         "import resource, signal, sys; sys.path[:0] = %r\nfrom episodes_test import *\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\nepisodes = EpisodeWriter(%r, SPEC, 20)\nepisodes.begin('go')\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, -1))\nepisodes = EpisodeWriter(%r, SPEC, 20)\nepisodes.begin('go')\n"
         "try:\n  for i in range(50): episodes.add(seen(i), action(i))\n  episodes.end(True)\n"
-        "except IoError as error: print(error); sys.exit(3)\n"
+        "except IoError as error: print(error)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (-1, -1))\n"
+        "try: episodes.close()\nexcept IoError: pass\n"
+        "episodes.begin('again')\nfor i in range(30): episodes.add(seen(i), action(i))\nepisodes.end(True)\nsys.exit(3)\n"
     ) % ([str(Path(__file__).parent), str(Path(__file__).resolve().parents[2] / "python")], str(tmp_path))
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 3 and "a disk that takes frames" in done.stdout, done.stderr
-    (episode,) = episodes_of(tmp_path)
+    episode, again = episodes_of(tmp_path)
     assert episode.n_frame > 5 and [frame["tick"] for frame in episode] == list(range(episode.n_frame))
+    assert again.n_frame == 30 and again.header.success  # of a disk that has room again
 
 
 @pytest.mark.parametrize(

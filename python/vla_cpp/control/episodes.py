@@ -23,8 +23,9 @@ import queue
 import re
 import threading
 from dataclasses import asdict, dataclass
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO, Dict, Iterator, List, Mapping, Optional, Tuple, Union
+from typing import Any, Dict, Iterator, List, Mapping, Optional, Tuple, Union
 
 import numpy as np
 
@@ -129,7 +130,7 @@ class EpisodeWriter:
             self._at.mkdir()
         except OSError as problem:
             raise IoError(str(self._folder), "a place to write", str(problem)) from None
-        self._text, self._header = text, None
+        self._text, self._header, self._problem = text, None, None
 
     def add(self, observation: Mapping[str, Any], action: Action) -> None:
         """One control period: what `policy.act` would be given, and what `loop.step` returned.
@@ -199,22 +200,23 @@ class EpisodeWriter:
         )  # fmt: skip
         try:
             write_header(self._at, self._header)
-            file = open(self._at / FRAMES, "xb")
+            file = open(self._at / FRAMES, "xb", buffering=0)
         except OSError as problem:
             raise IoError(str(self._at), "a place to write", str(problem)) from None
         self._thread = threading.Thread(target=self._write, args=(file,), daemon=True)
         self._thread.start()
 
-    def _write(self, file: BinaryIO) -> None:
+    def _write(self, file: FileIO) -> None:
+        """Appends frames until `_stop`. After a problem it only takes them, and what was written of the last one is cut off."""
         with file:
             while (data := self._queue.get()) is not None:
-                if self._problem is None:
-                    try:
-                        file.write(data)
-                        file.flush()
-                    except OSError as problem:
-                        self._problem = problem
-                        file.truncate(file.tell() // len(data) * len(data))
+                try:
+                    left = memoryview(data if self._problem is None else b"")
+                    while left:
+                        left = left[file.write(left) :]
+                except OSError as problem:
+                    self._problem = problem
+                    file.truncate(file.tell() // len(data) * len(data))
 
     def _stop(self) -> None:
         if self._thread is not None:
