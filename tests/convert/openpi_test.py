@@ -234,6 +234,13 @@ def test_a_checkpoint_of_openpi_is_refused_by_name(converter, message):
     assert message in converter.refusal(tiny, variant="pi0_libero").message()
 
 
+def test_other_quantiles_than_the_policys_are_refused_by_name(converter):
+    tiny = openpi("pi05_libero")
+    tiny.norm_stats["state"] = {"q02": [0.0] * 8, "q98": [1.0] * 8}
+    error = converter.refusal(tiny, variant="pi05_libero")
+    assert "norm_stats.state.q01: expected 8 numbers, found none (there are q02, q98)" in error.message()
+
+
 def test_openpi_always_normalizes(converter):
     error = converter.refusal(openpi("pi0_libero"), variant="pi0_libero", identity_stats=["action"])
     assert "found one of openpi" in error.message()

@@ -433,11 +433,13 @@ def _assets(checkpoint: Checkpoint) -> List[str]:
 
 
 def _values(stats: dict, key: str, name: str, width: int, where: str, problems: Problems) -> np.ndarray:
-    values = member(stats, key, dict, where + ": norm_stats").get(name)
+    known = member(stats, key, dict, where + ": norm_stats")
+    values = known.get(name)
     place = "{}: norm_stats.{}.{}".format(where, key, name)
     numbers = isinstance(values, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
     if not numbers or len(values) < width:
-        found = "none" if values is None else "{} numbers".format(len(values)) if numbers else repr(values)[:80]
+        there = " (there are {})".format(", ".join(map(str, known))[:100]) if known else ""
+        found = "none" + there if values is None else "{} numbers".format(len(values)) if numbers else repr(values)[:80]
         problems.add(place, "{} numbers".format(width), found, "compute the data set's statistics again with openpi's script")
         return np.zeros(width, np.float32)
     with np.errstate(over="ignore"):  # told below
