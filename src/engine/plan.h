@@ -93,7 +93,7 @@ class Plan {
   // Tokens and state may be null. `start` is null unless the solver renoises; the last three are null without a
   // leftover.
   Slot *images_, *tokens_, *state_, *x_, *k_, *start_, *target_, *keep_, *pull_;
-  std::uint32_t views_;
+  std::uint64_t views_;
   Cache cache_;
   Injection injection_;
   int i_step_ = 0;  // the program that runs or ran last

@@ -95,7 +95,7 @@ InputShape Robot::largest_shape() const {
           .n_view = n_view,
           .n_text = recipe.max_tokens,
           .d_state = d_state_,
-          .views = view_key(static_cast<std::uint32_t>((std::uint64_t{1} << n_view) - 1))};
+          .views = view_key(~std::uint64_t{0} >> (64 - n_view))};
 }
 
 InputShape Robot::shape_of(const EncodedObservation& observation) const {
@@ -110,7 +110,7 @@ InputShape Robot::shape_of(const EncodedObservation& observation) const {
 }
 
 /// The key for views in a shape: two shapes are equal if the policy builds the same graph.
-std::uint32_t Robot::view_key(std::uint32_t views) const { return policy_->depends_on_which_views() ? views : 0; }
+std::uint64_t Robot::view_key(std::uint64_t views) const { return policy_->depends_on_which_views() ? views : 0; }
 
 RealTimeChunking Robot::real_time_chunking() const {
   return processor_.relative_actions() ? RealTimeChunking() : policy_->real_time_chunking();

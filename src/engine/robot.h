@@ -97,7 +97,7 @@ class Robot {
   Status make_conditions(const PlanContext& context);
   Status check_leftover(const Observation& observation, const Leftover& leftover, Inputs& inputs) const;
   ChunkShape chunk_shape() const;
-  std::uint32_t view_key(std::uint32_t views) const;
+  std::uint64_t view_key(std::uint64_t views) const;
   Result<std::vector<float>> start(const Noise& noise) const;
   std::vector<float> normalized(const std::vector<float>& x) const;
 

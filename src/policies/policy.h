@@ -20,13 +20,13 @@ struct PrefixInputs {
   Tensor images;            // [width, height, 3, n_view], in the image recipe's range
   Tensor tokens;            // [n_text] i32; none if the policy reads no instruction
   Tensor state;             // [d_state, 1], normalized and padded; none if policy.d_state is 0
-  std::uint32_t views = 0;  // bit i: view i of the bundle is present; 0 if only the number of views matters
+  std::uint64_t views = 0;  // bit i: view i of the bundle is present; 0 if only the number of views matters
 };
 
 /// The sizes of PrefixInputs. There is one plan for each.
 struct InputShape {
   int width = 0, height = 0, n_view = 0, n_text = 0, d_state = 0;
-  std::uint32_t views = 0;  // as PrefixInputs::views
+  std::uint64_t views = 0;  // as PrefixInputs::views
   bool steered = false;     // whether the solver continues a previous chunk
   auto operator<=>(const InputShape&) const = default;
 };

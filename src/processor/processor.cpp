@@ -107,7 +107,7 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs) 
   inputs.pixels.resize(present.size() * size);
   for (std::size_t i = 0; i < present.size(); ++i) {
     const auto& [index, name, frame] = present[i];
-    inputs.views |= 1U << index;
+    inputs.views |= std::uint64_t{1} << index;
     VLA_CHECK(check_frame(*frame, *name));
     if (frame->orientation != 1)
       inputs.notes.push_back(

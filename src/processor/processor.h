@@ -31,7 +31,7 @@ struct Observation {
 /// The host side of one observation, as the network reads it. Vectors keep their memory when filled again.
 struct Inputs {
   int n_view = 0;
-  std::uint32_t views = 0;  // bit i: view i of the bundle's order is present
+  std::uint64_t views = 0;  // bit i: view i of the bundle's order is present
   int height = 0, width = 0;
   std::vector<float> pixels;           // (n_view, 3, height, width), present views only, in the bundle's order
   std::vector<std::int32_t> tokens;    // at most `recipe().max_tokens`

@@ -99,8 +99,8 @@ def test_an_absent_mapping_is_that_of_the_class():
 
 def test_more_cameras_than_the_runtime_has_are_refused(refusal):
     camera = {"type": "VISUAL", "shape": [3, 33, 40]}
-    features = SMALL.config["input_features"] | {f"observation.images.extra{i}": camera for i in range(31)}
-    assert "input_features: expected at most 32 cameras, found 33" in refusal(path="input_features", value=features)
+    features = SMALL.config["input_features"] | {f"observation.images.extra{i}": camera for i in range(63)}
+    assert "input_features: expected at most 64 cameras, found 65" in refusal(path="input_features", value=features)
 
 
 def test_cameras_with_the_same_statistics_share_an_op():

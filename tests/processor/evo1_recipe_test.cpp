@@ -154,11 +154,11 @@ TEST_CASE("a threshold decides in world units, and what is no number is refused 
 TEST_CASE("more views than a mask has bits are refused") {
   EditableBundle bundle = sample();
   std::vector<std::string> names;
-  for (int i = 0; i < 33; ++i) names.push_back("observation.images." + std::to_string(i));
+  for (int i = 0; i < 65; ++i) names.push_back("observation.images." + std::to_string(i));
   bundle.set("observation.views", names);
-  bundle.set("observation.view_aliases", std::vector<std::string>(33));
-  bundle.set("observation.view_optional", std::vector<std::int64_t>(33));
-  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "observation.views: expected at most 32 views, found 33"));
+  bundle.set("observation.view_aliases", std::vector<std::string>(65));
+  bundle.set("observation.view_optional", std::vector<std::int64_t>(65));
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "observation.views: expected at most 64 views, found 65"));
 }
 
 TEST_CASE("every field of these ops but the number of a pad is required") {

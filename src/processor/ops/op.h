@@ -154,7 +154,7 @@ class ActionOp {
 /// Largest image side and vector that a recipe may ask for, so that a damaged number cannot ask for all memory.
 inline constexpr int kMaxImageSide = 8192;
 inline constexpr int kMaxVector = 65536;
-inline constexpr int kMaxViews = 32;
+inline constexpr int kMaxViews = 64;                   // as many as Inputs::views has bits
 inline constexpr std::size_t kMaxOpText = 1 << 12;     // bytes of a text that an op searches for or writes
 inline constexpr std::size_t kMaxViewsText = 1 << 20;  // bytes that a views op adds
 

@@ -42,7 +42,7 @@ IGNORED = set("pretrained_backbone_weights dropout kl_weight optimizer_lr_backbo
 # torchvision models/resnet.py: blocks of each stage. Those of the others have another block.
 BACKBONES = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
 ACTIVATIONS = {"relu": "relu", "gelu": "gelu_erf"}
-MAX_LAYERS, MAX_SIDE, MAX_VIEWS = 512, 8192, 32
+MAX_LAYERS, MAX_SIDE, MAX_VIEWS = 512, 8192, 64
 
 
 @dataclass
