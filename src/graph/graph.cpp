@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <algorithm>
 #include <atomic>
 
 #include "graph/shapes.h"
@@ -66,7 +67,21 @@ Tensor Graph::constant(std::vector<float> values, const Shape& shape) {
   return add(op::Constant{std::move(values)}, {}, shape);
 }
 
-Tensor Graph::name(const std::string& path, Tensor value) {
+namespace {
+
+/// `path`, or where a value of the graph has it, because a module runs again, `path#2`, `path#3` and so on.
+std::string unused(const std::deque<Node>& nodes, const std::string& path) {
+  std::string numbered = path;
+  const auto has_it = [&](const Node& node) { return node.path == numbered; };
+  for (int n = 2; std::any_of(nodes.begin(), nodes.end(), has_it); ++n) numbered = fmt::format("{}#{}", path, n);
+  return numbered;
+}
+
+}  // namespace
+
+Tensor Graph::name(const std::string& of_module, Tensor value) {
+  // Paths are read where values are recorded or replaced: elsewhere a second one of a name does no harm.
+  const std::string path = filter_ || injector_ ? unused(nodes_, of_module) : of_module;
   if (const Slot* slot = injector_ ? injector_(path, value) : nullptr) value = input(slot);
   Node& node = *value.node();
   if (node.path.empty()) node.path = path;

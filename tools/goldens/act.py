@@ -7,6 +7,7 @@ The towers are torchvision's own ResNet-18 and -34, which have one width only: f
 
 import zlib
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -206,6 +207,9 @@ CASES = {
         policy(6, 40, 5, 44, (1, 2, 2), vision_backbone="resnet34",
                normalization_mapping={"VISUAL": "MIN_MAX", "STATE": "MIN_MAX", "ENV": "MEAN_STD", "ACTION": "QUANTILES"}),
         {"camera": (64, 32)}, d_state=4, d_action=3, d_environment=11, dtype="BF16")),
+    # Cameras of two sizes: the backbone runs once for each, over one view and over two.
+    "act/two_sizes": case(35, {"front": (33, 70, "png"), "left": (41, 40, "png"), "right": (41, 40, "png")}, Checkpoint(
+        policy(6, 32, 4, 48, (1, 1, 1)), {"front": (33, 70), "left": (41, 40), "right": (41, 40)}, d_state=5, d_action=4)),
     # The older layout, with statistics among the weights; one view, one layer, one head.
     "act/old_layout": case(34, {"image": (25, 50, "png")}, Checkpoint(
         policy(4, 20, 1, 28, (1, 1, 1), temporal_ensemble_coeff=0.01, n_action_steps=1), {"image": (25, 50)}, d_state=2, d_action=2,
@@ -285,8 +289,11 @@ class Recorder(Taps):
         with torch.inference_mode():
             self.put("chunk", self.policy.predict_action_chunk(dict(batch))[0])
         for name, x in self.views.items():
-            if len({view.shape for view in x}) == 1:
-                self.put(name, torch.cat(x))
+            runs = [list(run) for _, run in groupby(x, key=lambda view: view.shape)]
+            if name == "pixels" and len(runs) > 1:
+                continue  # the runtime's are canvases of one size
+            for n, run in enumerate(runs, 1):
+                self.put(name if n == 1 else f"{name}#{n}", torch.cat(run))
         parts = [batch[name][0] for name in ("observation.state", ENVIRONMENT) if name in batch]
         self.put("state", torch.cat(parts))
         return self.taps
