@@ -87,7 +87,7 @@ class Engine:
         return {
             "images": {name: given[name] for name in self._views if name in given},
             "state": {name: given[name] for name in self._states if name in given},
-            "text": given.get(openpi.TEXT, ""),
+            "text": given.get(openpi.TEXT),
             "seed": seed,
         }
 

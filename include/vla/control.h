@@ -74,7 +74,7 @@ struct StateVector {
 struct Observation {
   std::vector<Frame> frames = {};
   std::vector<StateVector> states = {};
-  std::string text = {};
+  std::optional<std::string> text = {};  // may be empty; none for a policy that reads no instruction
   std::optional<std::uint64_t> seed = {};
 };
 

@@ -207,8 +207,8 @@ typedef struct vla_observation {
   size_t n_view;
   const vla_state* states; /* an array */
   size_t n_state;
-  const char* text;   /* the instruction, UTF-8; a NUL at the end is not needed and not counted. Empty, not
-                         NULL, for a policy that reads none, with max_text_tokens 0 */
+  const char* text;   /* the instruction, UTF-8, which may be empty; a NUL at the end is not needed and not counted.
+                         NULL: none is given, as for a policy that reads none, with max_text_tokens 0 */
   size_t text_size;   /* bytes */
   const float* noise; /* the solver's start, (noise_rows, d_noise) row by row, or NULL */
   size_t n_noise;     /* noise_rows * d_noise */

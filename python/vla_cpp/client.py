@@ -92,7 +92,7 @@ class Client(Handle):
         *,
         images: Mapping[str, Image],
         state: State,
-        text: str = "",
+        text: Optional[str] = None,
         seed: Optional[int] = None,
         noise: object = None,
         leftover: Optional[Leftover] = None,
@@ -106,7 +106,7 @@ class Client(Handle):
         images           frames by view: uint8 (height, width, 3) RGB of any size, a Pillow image, the bytes of a JPEG or PNG file, or
                          None for a camera that the robot does not have
         state            world units: vectors by name, or one vector where the policy has one state
-        text             the instruction, as a person says it; nothing for a policy that reads none
+        text             the instruction, as a person says it, which may be empty; None for a policy that reads none
         seed, noise      where the solver starts: a number, or float32 (noise_rows, d_noise); with neither a seed is drawn, and the
                          chunk tells it
         leftover         real-time chunking: the rows of the chunk before that are not executed yet; see Leftover

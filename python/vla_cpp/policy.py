@@ -92,7 +92,7 @@ class Policy(Handle):
         *,
         images: Mapping[str, Image],
         state: State,
-        text: str = "",
+        text: Optional[str] = None,
         seed: Optional[int] = None,
         noise: object = None,
         leftover: Optional[Leftover] = None,
@@ -170,7 +170,7 @@ class _Call:
         spec: Spec,
         images: Mapping[str, Image],
         state: State,
-        text: str,
+        text: Optional[str],
         seed: Optional[int],
         noise: object,
         leftover: Optional[Leftover],
@@ -182,14 +182,14 @@ class _Call:
             for name, values in states_of(state, spec.states).items()
         ]
         self._kept += [views, states]
-        sentence = _encoded("instruction", text, BadObservation)
+        sentence = None if text is None else _encoded("instruction", text, BadObservation)
         self.observation = _capi.Observation(
             views=(_capi.View * len(views))(*views),
             n_view=len(views),
             states=(_capi.State * len(states))(*states),
             n_state=len(states),
             text=sentence,
-            text_size=len(sentence),
+            text_size=len(sentence or b""),
             has_seed=seed is not None,
             seed=0 if seed is None else int(seed),
         )

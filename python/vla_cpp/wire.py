@@ -59,7 +59,7 @@ def act_bytes(
     *,
     images: Mapping[str, Image],
     state: State,
-    text: str,
+    text: Optional[str] = None,
     seed: Optional[int],
     noise: object,
     leftover: Optional[Leftover] = None,
@@ -80,10 +80,11 @@ def act_bytes(
             setattr(act.views.add(name=name), kind, data)
     for name, values in states_of(state, spec.states).items():
         act.states.add(name=name).values.extend(values.tolist())
-    if not isinstance(text, str):
+    if not isinstance(text, (str, type(None))):
         raise BadObservation("instruction", "a str", type(text).__name__)
     try:
-        act.text = text
+        if text is not None:
+            act.text = text
     except (ValueError, UnicodeError):
         raise BadObservation("instruction", "characters that UTF-8 can write", repr(text)[:80]) from None
     if noise is not None:

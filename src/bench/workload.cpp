@@ -59,8 +59,7 @@ Result<std::string> find_text(const Processor& processor, Observation observatio
     return Error{Code::usage, "--tokens", fmt::format("at most {}, which the bundle allows", most),
                  std::to_string(n_token)};
   for (const char* word : {"the ", "a", "1", "!?"}) {
-    std::string& text = observation.text;
-    text.clear();
+    std::string& text = observation.text.emplace();
     for (int i = 0; i < n_token; ++i) {
       text += word;
       const auto count = count_tokens(processor, observation);

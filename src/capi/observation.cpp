@@ -137,8 +137,8 @@ Result<Request> read_observation(const vla_observation* given, const Engine& eng
   if (known.text_size > Tokenizer::kMaxText)
     return Error{Code::bad_observation, "instruction", fmt::format("at most {} bytes", Tokenizer::kMaxText),
                  std::to_string(known.text_size)};
-  if (known.text == nullptr) return usage("observation.text", "an instruction", "NULL");
-  request.observation.text.assign(known.text, known.text_size);
+  if (known.text == nullptr && known.text_size > 0) return usage("observation.text", "a text", "NULL");
+  if (known.text != nullptr) request.observation.text.emplace(known.text, known.text_size);
   VLA_CHECK(read_states(known, robot->processor().states(), request.observation));
   VLA_CHECK(read_views(known, robot->processor().views(), request.observation));
   return request;

@@ -19,9 +19,10 @@ namespace {
 constexpr std::size_t kMaxFile = std::size_t{1} << 30;
 
 struct RunOptions {
-  std::string bundle, text, noise, out, tap, taps_out, inject, kernels, device, leftover, schedule, normalized_out,
+  std::string bundle, noise, out, tap, taps_out, inject, kernels, device, leftover, schedule, normalized_out,
       embodiment;
   std::vector<std::string> images, states, absent;
+  std::optional<std::string> text;
   std::optional<std::uint64_t> seed;
   std::optional<int> delay;
   std::optional<double> max_guidance;
@@ -264,7 +265,11 @@ Command add_run(CLI::App& app) {
       ->add_option("--state", options->states, "The robot's state in its own units; NAME= where the policy has several")
       ->type_name("[NAME=]v,v,...")
       ->allow_extra_args(false);
-  command->add_option("--text", options->text, "The instruction; none for a policy that reads none");
+  command
+      ->add_option_function<std::string>(
+          "--text", [options](const std::string& text) { options->text = text; },  // a std::optional would drop ""
+          "The instruction, which may be empty; none for a policy that reads none")
+      ->type_name("TEXT");
   add_text(*command, "--noise", options->noise, "FILE",
            "The solver's starting noise: a float32 .npy file, horizon x padded action width, or a batch of one of it");
   command

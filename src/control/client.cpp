@@ -331,7 +331,7 @@ struct Client::Impl {
       sent.set_name(state.name);
       sent.mutable_values()->Add(state.values.begin(), state.values.end());
     }
-    act.set_text(observation->text);
+    if (observation->text) act.set_text(*observation->text);
     act.set_policy(options.policy);
     act.set_embodiment(spec.embodiment);
     act.set_deadline_ms(static_cast<std::uint64_t>(std::ceil(1000 * options.timeout)));

@@ -180,7 +180,7 @@ void add_state(std::span<const std::byte> message, Json& states, std::size_t& le
 }
 
 Json act_json(std::span<const std::byte> act) {
-  Json json = {{"text", ""}, {"embodiment", ""}, {"states", Json::object()}, {"views", Json::array()}};
+  Json json = {{"text", nullptr}, {"embodiment", ""}, {"states", Json::object()}, {"views", Json::array()}};
   std::size_t n_value = kMaxValues;
   each_field(act, [&](const wire::Fields& field) {
     if (field.number == v1::Act::kDeadlineMsFieldNumber && field.type == 'v') json["deadline_ms"] = field.varint;

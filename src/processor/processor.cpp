@@ -146,20 +146,23 @@ Result<std::string> Processor::fill_prompt(const std::string& instruction, std::
 Status Processor::encode_text(const Observation& observation, Inputs& inputs) const {
   if (recipe_.max_tokens == 0) {
     inputs.tokens.clear();
-    if (!observation.text.empty()) inputs.notes.push_back("instruction: not read, since this policy knows one task");
+    if (!observation.text.value_or("").empty())
+      inputs.notes.push_back("instruction: not read, since this policy knows one task");
     return {};
   }
-  if (observation.text.empty()) return bad_observation("instruction", "a sentence", "empty text");
-  if (observation.text.size() > Tokenizer::kMaxText ||
-      unicode::valid_prefix(observation.text) < observation.text.size())
-    return tokenizer_->encode(observation.text).error();  // before anything reads it as characters
+  if (!observation.text) return bad_observation("instruction", "a text", "none", "give an empty one if that is meant");
+  const std::string& text = *observation.text;
+  if (text.size() > Tokenizer::kMaxText || unicode::valid_prefix(text) < text.size())
+    return tokenizer_->encode(text).error();  // before anything reads it as characters
   if (recipe_.discretizes_state && inputs.discretized_state.size() != n_state_)
     return Error{Code::internal, "instruction", "the state to be encoded before the text", "no state"};
-  VLA_TRY(const std::string prompt, fill_prompt(observation.text, inputs.discretized_state));
-  if (recipe_.drops_punctuation && prompt == *fill_prompt({}, inputs.discretized_state))
+  VLA_TRY(const std::string prompt, fill_prompt(text, inputs.discretized_state));
+  if (text.empty()) inputs.notes.push_back("instruction: empty");
+  // Of a full stop nothing is left.
+  if (recipe_.drops_punctuation && !text.empty() && prompt == *fill_prompt(".", inputs.discretized_state))
     return bad_observation("instruction", "a letter, digit or white space",
                            "nothing but punctuation, which is dropped");
-  if (has_foreign_letter(observation.text))
+  if (has_foreign_letter(text))
     inputs.notes.push_back("instruction: letters of another script than the Latin one, in which policies are trained");
   VLA_TRY(inputs.tokens, tokenizer_->encode(prompt, kMaxPrompt));
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);

@@ -23,7 +23,7 @@ namespace vla {
 struct Observation {
   std::map<std::string, std::optional<Frame>> views;  // nullopt: declared absent
   std::map<std::string, std::vector<float>> states;   // world units
-  std::string text;                                   // the instruction, UTF-8
+  std::optional<std::string> text = {};               // the instruction, UTF-8, which may be empty; nullopt: not given
   std::string embodiment = {};                        // the robot's tag; empty where the policy is for one
   bool reject_out_of_range = false;  // refuse a state or leftover beyond its bound, instead of a note in the answer
 };

@@ -405,9 +405,9 @@ Result<Observation> observe(const Value& message, const Names& names, const ActL
   const Value* text = at(message, names.text);
   if (text == nullptr) return Error{Code::bad_observation, names.text, "an instruction", "none"};
   VLA_TRY(observation.text, msgpack::text_of(*text, names.text));
-  if (observation.text.size() > limits.max_text)
+  if (observation.text->size() > limits.max_text)
     return Error{Code::too_large, names.text, fmt::format("at most {} bytes", limits.max_text),
-                 fmt::format("{} bytes", observation.text.size())};
+                 fmt::format("{} bytes", observation.text->size())};
   return observation;
 }
 

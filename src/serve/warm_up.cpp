@@ -17,10 +17,9 @@ constexpr std::uint64_t kTries = 3;
 std::string longest_text(const Processor& processor, Observation observation) {
   Inputs inputs;
   for (int n_word = processor.recipe().max_tokens; n_word > 0; n_word = n_word * 3 / 4) {
-    observation.text.clear();
-    for (int i = 0; i < n_word; ++i) observation.text += "go ";
-    if (processor.encode_state(observation, inputs) && processor.encode_text(observation, inputs))
-      return observation.text;
+    std::string& text = observation.text.emplace();
+    for (int i = 0; i < n_word; ++i) text += "go ";
+    if (processor.encode_state(observation, inputs) && processor.encode_text(observation, inputs)) return text;
   }
   return {};
 }

@@ -21,7 +21,7 @@ def example(request, build, tmp_path_factory):
     "at, wrong, part",
     [
         (0, "/nonexistent.gguf", "io: /nonexistent.gguf"),
-        (1, "", "bad_observation: instruction"),
+        (1, "go " * 30_000, "bad_observation: instruction"),
         (2, "0.1,x", ""),
         (2, "0.1", "bad_observation: observation.state: expected 6 numbers, found 1"),
         (3, "seven", ""),

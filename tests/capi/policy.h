@@ -60,7 +60,7 @@ struct Call {
     }
     observation.views = views.data(), observation.n_view = views.size();
     observation.states = states.data(), observation.n_state = states.size();
-    observation.text = golden.observation.text.data(), observation.text_size = golden.observation.text.size();
+    observation.text = golden.observation.text->data(), observation.text_size = golden.observation.text->size();
     observation.noise = golden.noise.data(), observation.n_noise = golden.noise.size();
   }
   Call(const Call&) = delete;

@@ -165,7 +165,7 @@ def test_the_spec_is_what_the_program_says_of_the_bundle(vla, policy, golden):
         (dict(state=[0.0] * 5 + [float("nan")]), vla_cpp.BadObservation, "nan"),
         (dict(state=[0.0] * 5 + [1e300]), vla_cpp.BadObservation, "finite"),
         (dict(state={"arm": [0.0] * 6}), vla_cpp.BadObservation, "arm"),
-        (dict(text=""), vla_cpp.BadObservation, "instruction"),
+        (dict(text=None), vla_cpp.BadObservation, "instruction"),
         (dict(text=b"open"), vla_cpp.BadObservation, "instruction"),
         (dict(text="\ud800"), vla_cpp.BadObservation, "instruction"),
         (dict(text="a" * 70000), vla_cpp.BadObservation, "instruction"),

@@ -69,6 +69,8 @@ TEST_CASE("NULL inside an observation is refused by its field") {
   refused([](Call& c) { c.observation.views = nullptr; }, VLA_USAGE, "observation.views");
   refused([](Call& c) { c.observation.states = nullptr; }, VLA_USAGE, "observation.states");
   refused([](Call& c) { c.observation.text = nullptr; }, VLA_USAGE, "observation.text");
+  refused([](Call& c) { c.observation.text = nullptr, c.observation.text_size = 0; }, VLA_BAD_OBSERVATION,
+          "instruction");
   refused([](Call& c) { c.observation.noise = nullptr; }, VLA_USAGE, "neither");
   refused([](Call& c) { c.views[1].name = nullptr; }, VLA_USAGE, "observation.views[1].name");
   refused([](Call& c) { c.views[1].data = nullptr; }, VLA_USAGE, "camera2");

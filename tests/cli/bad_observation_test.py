@@ -121,10 +121,6 @@ def test_noise_from_a_file_that_is_missing_is_an_io_error(refused, tmp_path):
 # The instruction.
 
 
-def test_an_empty_instruction_is_refused(refused):
-    refused("bad_observation", "instruction: expected a sentence, found empty text", text="")
-
-
 def test_an_instruction_of_100_kilobytes_is_refused_by_its_length(refused):
     refused("bad_observation", "instruction: expected at most 65536 bytes of text", text="pick up " * 12_500)
 

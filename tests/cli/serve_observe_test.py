@@ -85,7 +85,7 @@ def scrape(server, enough):
 def test_a_scrape_counts_requests_by_kind_and_code_and_times_every_stage(serve, talk, golden):
     server = serve("--metrics", "127.0.0.1:0")
     act = wire.act(1, golden, seed=1)
-    requests = [act, act, wire.act(2, golden, text=""), wire.health(3), b"\xff\xff garbage"]
+    requests = [act, act, wire.act(2, golden, has_text=False), wire.health(3), b"\xff\xff garbage"]
     assert talk(server, *requests) == ["chunk", "chunk", "error", "health", "error"]
     status, _, content_type = get(server.ready["metrics"], "/metrics")
     assert status == 200 and content_type.startswith("text/plain; version=0.0.4")
@@ -353,7 +353,7 @@ def recording(serve, talk, golden, tmp_path):
     server = serve("--record", folder)
     requests = [
         wire.act(1, golden, seed=5), wire.act(2, golden), wire.act(3, golden, deadline_ms=60_000),
-        wire.act(4, golden, text=""), b"garbage", wire.describe(6), wire.health(7),
+        wire.act(4, golden, has_text=False), b"garbage", wire.describe(6), wire.health(7),
     ]  # fmt: skip
     kinds = talk(server, *requests)
     assert kinds == ["chunk", "chunk", "chunk", "error", "error", "description", "health"]

@@ -67,12 +67,6 @@ def test_run_without_an_image_or_a_state_is_a_usage_error_that_names_it(vla, gol
     assert answer.code == 2 and answer.out == "" and left_out in answer.err and answer.err.count("\n") == 1
 
 
-def test_run_without_a_text_is_refused_by_a_policy_that_reads_one(vla, golden):
-    arguments = golden.arguments()
-    at = arguments.index("--text")
-    vla(*arguments[:at], *arguments[at + 2 :]).refused("bad_observation", "instruction: expected a sentence, found empty text")
-
-
 @pytest.mark.parametrize(
     "arguments, unknown",
     [

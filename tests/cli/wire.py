@@ -28,7 +28,7 @@ def rgb(width, height):
     return _number(1, width) + _number(2, height) + _bytes(3, bytes(3 * width * height))
 
 
-def act(request_id, golden, seed=None, deadline_ms=None, text=None, image=None, n_image=1):
+def act(request_id, golden, seed=None, deadline_ms=None, text=None, image=None, n_image=1, has_text=True):
     """The act that a golden case is, its images as PNG. `image` is (tag of its field, file) of another for the first
     `n_image` views."""
     files = [(b"\x22", file.read_bytes()) if file else (b"\x2a", b"") for file in golden.images.values()]
@@ -42,7 +42,7 @@ def act(request_id, golden, seed=None, deadline_ms=None, text=None, image=None, 
         _bytes(2, _bytes(1, name.encode()) + _bytes(2, struct.pack(f"<{len(state)}f", *state)))
         for name, state in features.items()
     )
-    body = views + states + _bytes(3, (golden.text if text is None else text).encode())
+    body = views + states + (_bytes(3, (golden.text if text is None else text).encode()) if has_text else b"")
     body += b"" if seed is None else _number(5, seed)
     body += b"" if deadline_ms is None else _number(7, deadline_ms)
     return _number(1, 1) + _number(2, request_id) + _bytes(5, body)

@@ -43,7 +43,7 @@ def recorded(case, tmp_path_factory):
             acts.append((images, state, text, robot.act(images=images, state=state, text=text, seed=i, capture_time_ns=i + 1)))
             time.sleep(max(0, 1 / FPS - (time.monotonic() - begun)))
         with pytest.raises(vla_cpp.VlaError):
-            robot.act(images=images, state=state, text="")
+            robot.act(images=images, state=state)
     assert server.stop() == 0
     return folder, acts
 

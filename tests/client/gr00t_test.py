@@ -94,6 +94,12 @@ def test_every_release_of_the_client_gets_the_chunk_of_vla_run(robot, served, tm
         assert joined(answer)[0].tobytes() == expected.tobytes()
 
 
+def test_an_empty_instruction_is_one(robot, served, tmp_path):
+    empty = {**nested(robot), "language": {"annotation.human.task_description": [[""]]}}
+    answer, _ = Client(served[1], npy_array).ask("get_action", {"observation": empty, "options": {"seed": 7}})
+    assert joined(answer)[0].tobytes() == ran(robot, tmp_path, "--seed", "7", text="").tobytes()
+
+
 def test_the_first_release_sends_the_observation_itself_and_gets_its_actions_without_a_batch(robot, served):
     client = Client(served[1], npy_array)
     answer = client.ask("get_action", flat(robot, 1))

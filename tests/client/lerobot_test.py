@@ -56,6 +56,13 @@ def test_a_chunk_is_the_policys_with_timesteps_and_times(case, robot):
     assert all(row.action.dtype == np.float32 and np.isfinite(row.action).all() for row in rows)
 
 
+def test_the_task_of_a_client_that_was_started_without_one_is_empty_and_is_answered(case, robot):
+    empty = observation(case, 7)
+    empty.observation["task"] = ""  # RobotClientConfig.task by default
+    robot.observe(empty)
+    assert [row.timestep for row in robot.actions()][0] == 7
+
+
 def test_recorded_acts_replay_to_the_same_chunk_bit_for_bit(case, tmp_path):
     with serving(case, "--lerobot", "127.0.0.1:0", "--record", tmp_path / "kept") as (_, address):
         with Robot(address("grpc://")) as robot:

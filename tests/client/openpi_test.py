@@ -64,6 +64,12 @@ def test_a_chunk_is_the_one_of_vla_run_bit_for_bit_in_every_layout_of_arrays(cas
     assert 0 < answer["policy_timing"]["infer_ms"] <= timing["infer_ms"] <= timing["prev_total_ms"] * 100
 
 
+def test_an_empty_prompt_is_an_instruction(case, client, tmp_path):
+    answer = client.ask(pack({**observation(case, 7), "prompt": ""}, openpi_array))
+    assert answer["actions"].tobytes() == ran(case, tmp_path, "--seed", "7", text="").tobytes()
+    assert "instruction: empty" in answer["notes"]
+
+
 def test_planes_and_floats_are_the_same_image(case, client):
     sound = observation(case, 3)
     expected = client.ask(pack(sound, openpi_array))["actions"].tobytes()

@@ -247,7 +247,7 @@ def test_the_policy_is_told_with_the_range_of_its_states(watched):
 def test_a_refusal_is_told(watched):
     last = watched.acts()["last"]
     with pytest.raises(vla_cpp.BadObservation):
-        watched.act(text="")
+        watched.act(text=None)
     (act,) = watched.acts(after=last)["acts"]
     assert act["code"] == "bad_observation" and act["error"]["where"] == "instruction" and "chunk" not in act
 

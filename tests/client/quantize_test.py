@@ -32,7 +32,7 @@ def recording(tmp_path_factory):
         for name, text in SCENES:
             robot.act(**scene(name, text))
         with pytest.raises(vla_cpp.BadObservation):
-            robot.act(**{**scene(*SCENES[0]), "text": ""})
+            robot.act(**{**scene(*SCENES[0]), "text": None})
     assert server.stop() == 0
     return folder
 

@@ -81,9 +81,9 @@ def frames(case):
     }
 
 
-def ran(case, folder, *start):
+def ran(case, folder, *start, text=None):
     """The chunk of `vla run`, which reads the same observation from files."""
-    arguments = case.arguments(options=("--out", folder / "run.npy"))
+    arguments = case.arguments(text=text, options=("--out", folder / "run.npy"))
     at = arguments.index("--noise")
     arguments[at : at + 2] = start
     subprocess.run([VLA, *map(str, arguments)], check=True, capture_output=True)

@@ -100,7 +100,7 @@ def test_absent_views_are_declared_as_none_and_may_be_left_out_where_optional(tm
         (dict(images={"nowhere": np.zeros((8, 8, 3), np.uint8)}), "nowhere"),
         (dict(state=[0.0] * 5), "state"),
         (dict(state={"elsewhere": [0.0] * 6}), "elsewhere"),
-        (dict(text=""), "text"),
+        (dict(text=None), "text"),
         (dict(images={"camera1": b"\x89PNG\r\n\x1a\nbroken", "camera2": None}), "camera1"),
     ],
 )
@@ -109,6 +109,11 @@ def test_what_the_policy_cannot_take_is_refused_by_name_and_the_next_act_is_serv
         client.act(**observation(case, **changed))
     assert where in str(caught.value) and caught.value.found
     assert len(client.act(**observation(case))) == 5
+
+
+def test_an_empty_text_is_answered_with_a_note(client, case):
+    answer = client.act(**observation(case, text="", seed=7))
+    assert "instruction: empty" in answer.notes and len(answer) == 5
 
 
 def test_too_long_a_text_is_too_large(client, case):

@@ -55,13 +55,18 @@ def test_an_observation_is_written_field_by_field():
     assert (act.deadline_ms, act.capture_time_ns, act.text) == (1, -5, "öffne")
 
 
+def test_an_empty_instruction_is_on_the_wire_and_none_is_not():
+    assert parsed(text="").act.HasField("text") and parsed(text="").act.text == ""
+    assert not parsed(text=None).act.HasField("text")
+
+
 @pytest.mark.parametrize(
     "changed",
     [
         dict(images=None),
         dict(images={3: None}),
         dict(images=[np.zeros((4, 4, 3), np.uint8)]),
-        dict(text=None),
+        dict(text=5),
         dict(text=b"go"),
         dict(text="\ud800"),
         dict(deadline_ms=0),

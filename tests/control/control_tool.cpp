@@ -203,7 +203,7 @@ struct Sent {
     }
     for (const Json& view : scenario["absent"]) observation.frames.push_back({.view = view});
     for (const auto& [name, values] : scenario["states"].items()) observation.states.push_back({name, values});
-    observation.text = scenario["text"];
+    observation.text = scenario["text"].get<std::string>();
   }
   std::vector<std::string> files;
   Observation observation;

@@ -69,7 +69,9 @@ def test_the_bundle_is_that_of_the_authors_files(saved, tmp_path):
     found = saved.convert()
     convert_checkpoint(str(saved.base), str(tmp_path / "base.gguf"), Options(embodiment=TAG, dtype="f32"))
     expected = read_bundle(str(tmp_path / "base.gguf"))
-    told = {"vla.source.name", "vla.checksum"}
+    told = {"vla.source.name", "vla.checksum", "processor.recipe"}
+    made, published = (json.loads(bundle.keys["processor.recipe"]) for bundle in (found, expected))
+    assert made["text"].pop(0) == {"op": "if_empty", "text": "Perform the task."} and made == published
     assert {k: v for k, v in found.keys.items() if k not in told} == {k: v for k, v in expected.keys.items() if k not in told}
     assert found.tensors.keys() == expected.tensors.keys()
     assert all(np.array_equal(found.tensors[name], expected.tensors[name]) for name in expected.tensors)

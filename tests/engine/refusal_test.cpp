@@ -175,7 +175,7 @@ TEST_CASE("VLA-JEPA refuses instructions that its prompt has no place for, and f
     CHECK(refused(bad).find(std::string("instruction: expected text without ") + token) != std::string::npos);
   }
   Observation bad = golden.observation;
-  for (int i = 0; i < 2000; ++i) bad.text += " go";
+  for (int i = 0; i < 2000; ++i) *bad.text += " go";
   CHECK(refused(bad).find("shorten the instruction") != std::string::npos);
   bad = golden.observation;
   bad.views["front"] = Frame{36, 48, std::get<std::vector<std::uint8_t>>(bad.views["front"]->rgb)};
@@ -267,7 +267,7 @@ TEST_CASE("wrong views, counts and numbers are refused by name, and the next req
   bad.states["state"][2] = std::numeric_limits<float>::quiet_NaN();
   check_observation_refused(bad, golden.noise, Code::bad_observation, "nan");
   bad = golden.observation;
-  bad.text = "";
+  bad.text.reset();
   check_observation_refused(bad, golden.noise, Code::bad_observation, "instruction");
   bad.text = std::string(100000, 'a');
   check_observation_refused(bad, golden.noise, Code::bad_observation, "instruction");

@@ -26,7 +26,7 @@ TEST_CASE("while one thread acts two others prepare for either robot, and no ans
   const auto observation = [&](int round, const char* robot) {
     Observation of_robot = golden.observation;
     of_robot.embodiment = robot;
-    for (int i = 0; i < round % 3; ++i) of_robot.text += " please";
+    for (int i = 0; i < round % 3; ++i) *of_robot.text += " please";
     return of_robot;
   };
   std::vector<std::vector<float>> expected;

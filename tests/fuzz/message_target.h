@@ -43,7 +43,7 @@ inline bool check_observation(const Observation& observation, const serve::ActLi
     if (frame && !check_frame(*frame, name, {limits.max_pixels})) std::abort();
     if (frame) pixels += std::int64_t{frame->width} * frame->height;
   }
-  if (pixels > limits.max_pixels || observation.text.size() > limits.max_text) std::abort();
+  if (pixels > limits.max_pixels || observation.text.value_or("").size() > limits.max_text) std::abort();
   return true;
 }
 

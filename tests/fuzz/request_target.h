@@ -48,7 +48,8 @@ inline RequestFate check_request(std::span<const std::byte> bytes) {
     const auto act =
         serve::decode_act(envelope.body(bytes), kLimits, FeatureNames("view", {}, {}), FeatureNames("state", {}, {}));
     if (!act) return refuse(act.error()), fate;
-    if (act->observation.text.size() > kLimits.max_text || act->observation.views.size() > kLimits.max_views)
+    if (act->observation.text.value_or("").size() > kLimits.max_text ||
+        act->observation.views.size() > kLimits.max_views)
       std::abort();
     for (const auto& [name, frame] : act->observation.views)
       if (frame && !check_frame(*frame, name, {kLimits.max_pixels})) std::abort();

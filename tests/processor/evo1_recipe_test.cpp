@@ -62,7 +62,7 @@ TEST_CASE("a prompt with places for views has the reference's tokens") {
   for (const Json& text_and_ids : data_json("views.json")) {
     Observation seen = observation();
     seen.text = text_and_ids[0];
-    CAPTURE(seen.text);
+    CAPTURE(*seen.text);
     const auto inputs = processor.encode(seen);
     REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
     CHECK(inputs->tokens == std::vector<std::int32_t>(text_and_ids.begin() + 1, text_and_ids.end()));
@@ -79,19 +79,19 @@ TEST_CASE("an instruction that holds the token of a place is refused") {
 
 TEST_CASE("a long instruction is cut behind the places, and one that would cut them is refused") {
   Observation seen = observation();
-  for (int i = 0; i < 30; ++i) seen.text += " pick up the cube";
+  for (int i = 0; i < 30; ++i) *seen.text += " pick up the cube";
   const auto inputs = make(evo1()).encode(seen);
   REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
   CHECK(inputs->tokens.size() == 64);
   CHECK(inputs->notes.size() == 1);
-  CHECK(contains(refused_text(make(evo1(with("/text/2/truncate", "left"))), seen.text), "the places of the views"));
+  CHECK(contains(refused_text(make(evo1(with("/text/2/truncate", "left"))), *seen.text), "the places of the views"));
 }
 
 TEST_CASE("an instruction of 64 KiB fits behind the places and a longer one is refused") {
   Observation seen = observation();
   seen.text = std::string(Tokenizer::kMaxText, 'a');
   CHECK(make(evo1()).encode(seen).ok());
-  CHECK(contains(refused_text(make(evo1()), seen.text + "a"), "at most 65536 bytes"));
+  CHECK(contains(refused_text(make(evo1()), *seen.text + "a"), "at most 65536 bytes"));
 }
 
 TEST_CASE("places that are not where the bundle says are refused") {
@@ -186,7 +186,7 @@ TEST_CASE("values that have no meaning to these ops are refused") {
   for (const char* open : {"{i}{i}", "{i} {", "{i} {n}"})
     CHECK(contains(refused(with("/text/1/open", open)), "processor.recipe.text[1].open"));
   CHECK(contains(refused(with("/text/1/token", "")), "processor.recipe.text[1].token"));
-  CHECK(contains(refused(with("/text/1/count", 33)), "processor.recipe.text[1].count"));
+  CHECK(contains(refused(with("/text/1/count", 65)), "processor.recipe.text[1].count"));
   CHECK(contains(refused(with("/text/1/repeat", 60000)), "processor.recipe.text[1].repeat"));
   CHECK(contains(refused(with("/state/1/high", -2.0)), "processor.recipe.state[1].high"));
   CHECK(contains(refused(with("/state/2/value", "0")), "processor.recipe.state[2].value"));

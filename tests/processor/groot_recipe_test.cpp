@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Ops of a policy whose images keep their aspect and whose instruction is cleaned: GR00T N1.7.
+#include <algorithm>
 #include <cmath>
 
 #include "processor/ops/normalize.h"
@@ -250,6 +251,32 @@ TEST_CASE("a chunk has the rows that the recipe keeps, and a clip hides nothing"
   EditableBundle bundle = groot();
   bundle.set("policy.horizon", std::int64_t{1});
   CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.action[0].count"));
+}
+
+TEST_CASE("an empty instruction becomes what the recipe says, and one of punctuation alone is still refused") {
+  Json recipe = Json::parse(kRecipe);
+  recipe["text"].insert(recipe["text"].begin(), Json{{"op", "if_empty"}, {"text", "Pick up."}});
+  EditableBundle bundle = groot();
+  bundle.set("processor.recipe", recipe.dump());
+  const Processor plain = make(groot()), filled = make(bundle);
+  Observation empty = observation(), words = observation();
+  empty.states["state"] = words.states["state"] = {0.0f, 5.0f};
+  for (const char* view : {"top", "wrist", "side"})
+    empty.views[view] = words.views[view] = Frame{4, 4, std::vector<std::uint8_t>(48, 255)};
+  empty.text = "", words.text = "pick up";
+  const auto inputs = filled.encode(empty);
+  REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+  CHECK(inputs->tokens == plain.encode(words)->tokens);
+  CHECK(std::count(inputs->notes.begin(), inputs->notes.end(), "instruction: empty") == 1);
+  CHECK(filled.encode(words)->tokens == inputs->tokens);
+  CHECK(plain.encode(empty)->tokens != inputs->tokens);
+  words.text = "?!";
+  for (const Processor* processor : {&plain, &filled})
+    CHECK(contains(refusal(processor->encode(words), Code::bad_observation), "nothing but punctuation"));
+  recipe["text"][0]["text"] = "";
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle),
+                 "processor.recipe.text[0].text: expected a text that is not empty"));
 }
 
 TEST_CASE("a template stands around the places for views, and words must be left of an instruction") {

@@ -254,7 +254,7 @@ TEST_CASE("a tokenizer that cuts on the left keeps the end of a long instruction
   bundle.set("processor.recipe", recipe.dump());
   Observation seen = observation();
   seen.text = "pick up the red cube and place it in the bowl";
-  const auto whole = *Tokenizer::create(tokenizer_keys("smol"), 4096)->encode(seen.text + "\n");
+  const auto whole = *Tokenizer::create(tokenizer_keys("smol"), 4096)->encode(*seen.text + "\n");
   const auto inputs = make(bundle).encode(seen);
   REQUIRE(inputs.ok());
   CHECK(inputs->notes[0] == "instruction: 13 tokens, cut to the last 8");
@@ -268,10 +268,21 @@ TEST_CASE("the suffix is added once") {
   CHECK(make().encode(once)->tokens == make().encode(twice)->tokens);
 }
 
-TEST_CASE("instructions that are empty, too long or not UTF-8 are refused") {
+TEST_CASE("an empty instruction is one, and has a note") {
+  Observation empty = observation(), blank = observation();
+  empty.text = "";
+  blank.text = "\n";  // the suffix alone
+  const auto inputs = make().encode(empty);
+  REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+  CHECK(inputs->tokens == make().encode(blank)->tokens);
+  CHECK(inputs->notes == std::vector<std::string>{"instruction: empty"});
+  CHECK(make().encode(blank)->notes.empty());
+}
+
+TEST_CASE("instructions that are not given, too long or not UTF-8 are refused") {
   Observation bad = observation();
-  bad.text = "";
-  CHECK(contains(refused(bad), "instruction: expected a sentence, found empty text"));
+  bad.text.reset();
+  CHECK(contains(refused(bad), "instruction: expected a text, found none; give an empty one if that is meant"));
   bad.text = std::string(100'000, 'a');
   CHECK(contains(refused(bad), "instruction: expected at most 65536 bytes"));
   bad.text = "pick \xc3 up";
@@ -387,7 +398,7 @@ TEST_CASE("a text that is cut at its start keeps what stands in front of every t
     CHECK(inputs->tokens.size() == 4);
     CHECK(inputs->tokens.front() == 2);
     CHECK(inputs->notes.size() == 1);
-    const auto all = *Tokenizer::create(tokenizer_keys("gemma"), 4096)->encode(seen.text + "\n");
+    const auto all = *Tokenizer::create(tokenizer_keys("gemma"), 4096)->encode(*seen.text + "\n");
     CHECK(inputs->tokens[1] == (std::string(side) == "right" ? all[1] : all[all.size() - 3]));
   }
 }
@@ -400,7 +411,7 @@ TEST_CASE("a text that is cut keeps what stands around every text") {
   Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
   Observation seen = observation();
   seen.text = "pick up the red cube and place it in the bowl";
-  const auto all = *Tokenizer::create(bert, 4096)->encode(seen.text);
+  const auto all = *Tokenizer::create(bert, 4096)->encode(*seen.text);
   const auto cut_to = [&](int n, const char* side) {
     recipe["text"][1]["max_tokens"] = n;
     recipe["text"][1]["truncate"] = side;
@@ -510,8 +521,10 @@ TEST_CASE("a policy that reads no instruction needs no tokenizer, and notes an i
   const Processor processor = make(bundle);
   CHECK(processor.tokenizer() == nullptr);
   Observation seen = observation();
-  seen.text = "";
+  seen.text.reset();
   const auto silent = processor.encode(seen), told = processor.encode(observation());
+  seen.text = "";
+  CHECK(processor.encode(seen)->notes.empty());
   REQUIRE_MESSAGE(silent.ok(), silent.error().message());
   REQUIRE_MESSAGE(told.ok(), told.error().message());
   CHECK(silent->notes.empty());

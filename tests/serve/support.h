@@ -44,7 +44,7 @@ inline v1::Request act_request(const GoldenCase& golden, std::uint64_t request_i
     state.set_name(name);
     state.mutable_values()->Add(values.begin(), values.end());
   }
-  act.set_text(golden.observation.text);
+  act.set_text(*golden.observation.text);
   act.set_seed(1);
   return request;
 }

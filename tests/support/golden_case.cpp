@@ -19,7 +19,7 @@ GoldenCase GoldenCase::read(const std::string& path) {
   GoldenCase golden;
   golden.path = path;
   const auto json = nlohmann::json::parse(read_text(path + "/observation.json"));
-  golden.observation.text = json.at("text");
+  golden.observation.text = json.at("text").get<std::string>();
   const auto& state = json.at("state");  // numbers, or several features by name
   if (state.is_object())
     golden.observation.states = state.get<std::map<std::string, std::vector<float>>>();

@@ -130,6 +130,14 @@ struct RefuseOp final : TextOp {
   }
 };
 
+/// An empty text becomes `text`.
+struct IfEmptyOp final : TextOp {
+  std::string text;
+  Result<std::string> apply(std::string given, std::span<const int>) const override {
+    return given.empty() ? text : given;
+  }
+};
+
 struct EnsureSuffixOp final : TextOp {
   std::string suffix;
   Result<std::string> apply(std::string text, std::span<const int>) const override {
@@ -168,6 +176,11 @@ Status read(JsonFields& fields, RefuseOp& op, Recipe& recipe) {
     return misplaced(fields, "refuse before other ops");
   VLA_TRY(op.text, read_text(fields, "text"));
   return op.text.empty() ? fields.wrong("text", "text to look for") : Status();
+}
+
+Status read(JsonFields& fields, IfEmptyOp& op, Recipe&) {
+  VLA_TRY(op.text, read_text(fields, "text"));
+  return op.text.empty() ? fields.wrong("text", "a text that is not empty") : Status();
 }
 
 Status read(JsonFields& fields, EnsureSuffixOp& op, Recipe&) {
@@ -231,6 +244,7 @@ Ops text_ops() {
           {"text", "drop_punctuation", parse<EditOp<python::drop_punctuation>>},
           {"text", "replace", parse<ReplaceOp>},
           {"text", "refuse", parse<RefuseOp>},
+          {"text", "if_empty", parse<IfEmptyOp>},
           {"text", "ensure_suffix", parse<EnsureSuffixOp>},
           {"text", "template", parse<TemplateOp>},
           {"text", "views", parse<ViewsOp>},

@@ -222,7 +222,7 @@ Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits&
                               const FeatureNames& states) {
   VLA_TRY(v1::Act act, parse<v1::Act>(bytes, 0, "act", limits.max_text));
   ActRequest request;
-  request.observation.text = std::move(*act.mutable_text());
+  if (act.has_text()) request.observation.text = std::move(*act.mutable_text());
   request.observation.embodiment = std::move(*act.mutable_embodiment());
   request.capture_time_ns = act.capture_time_ns();
   VLA_CHECK(decode_views(act, limits, views, request.observation));

@@ -164,7 +164,7 @@ Record record_of(std::uint64_t request_id, const Reply& reply, const v1::Descrip
     state.set_name(name);
     state.mutable_values()->Add(values.begin(), values.end());
   }
-  act.set_text(given.observation.text);
+  if (given.observation.text) act.set_text(*given.observation.text);
   if (given.seed) act.set_seed(*given.seed);
   act.set_embodiment(given.observation.embodiment);
   v1::Response response = response_to(request_id);

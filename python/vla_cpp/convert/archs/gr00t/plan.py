@@ -168,7 +168,7 @@ def assemble(parts: Parts, keys: List[Key], rows: Rows, checkpoint: Checkpoint, 
     prompt = backbone.read_prompt(tokenizer, parts.folder, s, problems)
     document = {
         "image": parts.images.ops,
-        "text": text_ops(backbone.TEMPLATE, parts.formalize, prompt, s),
+        "text": text_ops(backbone.TEMPLATE, parts.formalize, prompt, s, bool(checkpoint.documents)),
         "state": state_ops(robot, s, problems),
         "action": action_ops(robot, s, problems),
     }
