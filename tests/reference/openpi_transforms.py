@@ -16,7 +16,7 @@ FLIPS = np.array([1, -1, -1, 1, 1, 1, 1] * 2, np.float64)
 GRIPPERS = [6, 13]
 ARMS = [*range(6), *range(7, 13)]
 # DeltaActions of the named configurations.
-RELATIVE = {"pi0_aloha_sim": [], "pi0_libero": range(6), "pi05_libero": [], "pi05_full_droid_finetune": range(7)}
+RELATIVE = {"pi0_aloha_sim": [], "pi0_libero": range(6), "pi0_libero_low_mem_finetune": range(6), "pi05_libero": [], "pi05_full_droid_finetune": range(7)}
 
 
 class Transforms:
