@@ -118,6 +118,20 @@ Result<std::string> JsonFields::string(const std::string& name) {
   return value->get<std::string>();
 }
 
+Result<std::vector<std::string>> JsonFields::strings(const std::string& name) {
+  constexpr const char* kExpected = "a list of different strings that are not empty";
+  VLA_TRY(const Json* value, field(name, kExpected));
+  if (!value->is_array()) return wrong(name, kExpected);
+  std::vector<std::string> list;
+  std::set<std::string> seen;
+  for (const Json& item : *value) {
+    if (!item.is_string() || item.get<std::string>().empty() || !seen.insert(item.get<std::string>()).second)
+      return wrong(name, kExpected);
+    list.push_back(item.get<std::string>());
+  }
+  return list;
+}
+
 Result<int> JsonFields::choice(const std::string& name, const std::vector<const char*>& spellings) {
   VLA_TRY(const std::string text, string(name));
   std::string expected;

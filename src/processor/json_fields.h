@@ -41,6 +41,8 @@ class JsonFields {
   Result<std::vector<float>> numbers(const std::string& name, std::size_t count, Range range);
   Result<bool> boolean(const std::string& name);
   Result<std::string> string(const std::string& name);
+  /// A list of distinct strings that are not empty.
+  Result<std::vector<std::string>> strings(const std::string& name);
   /// The index of the value among these spellings.
   Result<int> choice(const std::string& name, const std::vector<const char*>& spellings);
 

@@ -165,12 +165,14 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
   if (has_foreign_letter(text))
     inputs.notes.push_back("instruction: letters of another script than the Latin one, in which policies are trained");
   VLA_TRY(inputs.tokens, tokenizer_->encode(prompt, kMaxPrompt));
-  const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
+  const auto own = recipe_.limits.find(observation.text);
+  const auto limit = static_cast<std::size_t>(own != recipe_.limits.end() ? own->second : recipe_.max_tokens);
   if (inputs.tokens.size() > limit) {
     inputs.notes.push_back(fmt::format("instruction: {} tokens, cut to the {} {}", inputs.tokens.size(),
                                        recipe_.keep_last ? "last" : "first", limit));
-    cut_tokens(inputs.tokens);
+    cut_tokens(inputs.tokens, limit);
   }
+  if (recipe_.pad_id) inputs.tokens.resize(limit, *recipe_.pad_id);
   return view_tokens_.empty() ? Status() : check_view_places(inputs.tokens);
 }
 
@@ -188,8 +190,7 @@ Status Processor::check_view_places(std::span<const std::int32_t> tokens) const 
 }
 
 /// Keeps as many tokens as the recipe says. What stands around every text is not part of it and stays.
-void Processor::cut_tokens(std::vector<std::int32_t>& tokens) const {
-  const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
+void Processor::cut_tokens(std::vector<std::int32_t>& tokens, std::size_t limit) const {
   const std::size_t n_cut = tokens.size() - limit;
   const std::size_t first = recipe_.keep_last ? std::min(tokenizer_->prefix().size(), limit)
                                               : limit - std::min(tokenizer_->suffix().size(), limit);

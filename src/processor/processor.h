@@ -122,7 +122,7 @@ class Processor {
   Result<std::string> fill_prompt(const std::string& instruction, std::span<const int> state) const;
   Status encode_view(const Frame& frame, const std::string& name, int view, std::span<float> out) const;
   Status check_view_places(std::span<const std::int32_t> tokens) const;
-  void cut_tokens(std::vector<std::int32_t>& tokens) const;
+  void cut_tokens(std::vector<std::int32_t>& tokens, std::size_t limit) const;
   Status read_degraded(const Keys& keys);
   std::string state_place(std::size_t i) const;
   Status check_bound(const StateOp& op, bool reject, Inputs& inputs) const;

@@ -63,16 +63,22 @@ Result<Processor> Processor::create(const Bundle& bundle, std::shared_ptr<const 
   if (keys.has("lm.n_vocab") != has_text)
     return misfit("processor.recipe.text", has_text ? "none, without lm.n_vocab" : "tokenize as the last op",
                   has_text ? "tokenize" : "none");
+  int n_vocab = 0;
+  if (has_text) {
+    VLA_TRY(n_vocab, keys.integer("lm.n_vocab", {1, 1 << 24}));
+  }
   if (has_text && processor.tokenizer_ == nullptr) {
-    VLA_TRY(const int n_vocab, keys.integer("lm.n_vocab", {1, 1 << 24}));
     VLA_TRY(Tokenizer read, Tokenizer::create(keys, n_vocab));
     processor.tokenizer_ = std::make_shared<const Tokenizer>(std::move(read));
   }
   const int n_around =
       has_text ? static_cast<int>(processor.tokenizer_->prefix().size() + processor.tokenizer_->suffix().size()) : 0;
-  if (processor.recipe_.max_tokens < n_around)
-    return misfit("processor.recipe.text", fmt::format("{} tokens or more, which stand around every text", n_around),
-                  std::to_string(processor.recipe_.max_tokens));
+  for (const int limit : processor.recipe_.text_limits())
+    if (limit < n_around)
+      return misfit("processor.recipe.text", fmt::format("{} tokens or more, which stand around every text", n_around),
+                    std::to_string(limit));
+  if (const int pad = processor.recipe_.pad_id.value_or(0); has_text && pad >= n_vocab)
+    return misfit("processor.recipe.text", fmt::format("a pad_id below {} (lm.n_vocab)", n_vocab), std::to_string(pad));
   VLA_TRY(const int max_text_tokens,
           keys.integer("observation.max_text_tokens", {has_text ? 1.0 : 0.0, has_text ? kMaxVector : 0.0}));
   if (processor.recipe_.max_tokens > max_text_tokens)

@@ -77,6 +77,12 @@ Status check_state(const Recipe& recipe) {
 
 }  // namespace
 
+std::vector<int> Recipe::text_limits() const {
+  std::vector<int> all = {max_tokens};
+  for (const auto& [instruction, limit] : limits) all.push_back(limit);
+  return all;
+}
+
 Result<Recipe> parse_recipe(const std::string& json) {
   VLA_TRY(const Json document, parse_json(json, kWhere));
   if (!document.is_object()) return Error{Code::bad_bundle, kWhere, "a JSON object", "other text"};

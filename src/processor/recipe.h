@@ -2,7 +2,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <functional>
+#include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -15,12 +18,14 @@ struct ViewsOp;
 
 /// The parsed and checked `processor.recipe` (docs/bundle.md): the ops on each input and on the actions, in order.
 struct Recipe {
-  std::unique_ptr<Fit> fit;                     // the first image op or ops; later ops work on planes of one size
-  int width = 0, height = 0;                    // size of those planes
-  std::vector<std::unique_ptr<PlaneOp>> image;  // the others
-  std::vector<std::unique_ptr<TextOp>> text;    // all ops except the last, tokenize
-  int max_tokens = 0;                           // 0: the policy reads no instruction
-  bool keep_last = false;                       // keeps the last tokens of a text that is too long, else the first
+  std::unique_ptr<Fit> fit;                        // the first image op or ops; later ops work on planes of one size
+  int width = 0, height = 0;                       // size of those planes
+  std::vector<std::unique_ptr<PlaneOp>> image;     // the others
+  std::vector<std::unique_ptr<TextOp>> text;       // all ops that change it
+  int max_tokens = 0;                              // 0: the policy reads no instruction
+  std::map<std::string, int, std::less<>> limits;  // smaller limits than max_tokens, of these instructions
+  std::optional<int> pad_id;                       // fills a text up to its limit
+  bool keep_last = false;                          // keeps the last tokens of a text that is too long, else the first
   std::vector<std::unique_ptr<StateOp>> state;
   std::vector<std::unique_ptr<ActionOp>> action;
 
@@ -28,6 +33,9 @@ struct Recipe {
   bool drops_punctuation = false;   // an op removes such characters, so an instruction of nothing else would be lost
   bool prompt_takes_state = false;  // a template has {state}
   bool discretizes_state = false;   // the state list ends in bins
+
+  /// Limits of texts, in tokens: `max_tokens`, and those of single instructions.
+  std::vector<int> text_limits() const;
 };
 
 /// Errors: bad_bundle with a place like `processor.recipe.image[0].filter`, for anything that the document does not

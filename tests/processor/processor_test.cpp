@@ -430,6 +430,43 @@ TEST_CASE("a text that is cut keeps what stands around every text") {
   CHECK(contains(refusal(create(bundle), Code::bad_bundle), "2 tokens or more, which stand around every text"));
 }
 
+TEST_CASE("a text is filled up to its limit, which single instructions have of their own") {
+  EditableBundle bundle = sample();
+  const Keys bert = tokenizer_keys("bert");
+  for (const auto& [key, value] : bert.all()) bundle.set(key, value);
+  for (const char* key : {"tokenizer.pre", "tokenizer.ignore_merges", "tokenizer.merges"}) bundle.remove_key(key);
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  const Json limit = {{"op", "limit"}, {"max_tokens", 5}, {"instructions", {"open it now", "push"}}};
+  recipe["text"] = {limit, {{"op", "tokenize"}, {"max_tokens", 8}, {"truncate", "right"}, {"pad_id", 0}}};
+  bundle.set("processor.recipe", recipe.dump());
+  const Processor processor = make(bundle);
+  const auto tokens = [&](const std::string& text) {
+    Observation seen = observation();
+    seen.text = text;
+    return processor.encode(seen)->tokens;
+  };
+  for (const char* text : {"push", "open it now", "push ", "Push", "open the door"}) {
+    CAPTURE(text);
+    const bool is_named = std::string(text) == "push" || std::string(text) == "open it now";
+    auto expected = *Tokenizer::create(bert, 4096)->encode(text);
+    const std::size_t n = is_named ? 5 : 8;
+    if (expected.size() > n) expected.erase(expected.begin() + static_cast<std::ptrdiff_t>(n) - 1, expected.end() - 1);
+    expected.resize(n, 0);
+    CHECK(tokens(text) == expected);
+  }
+  const auto refused_with = [&](const char* field, const Json& value) {
+    Json changed = recipe;
+    changed["text"][std::string(field) == "pad_id" ? 1 : 0][field] = value;
+    bundle.set("processor.recipe", changed.dump());
+    return refusal(create(bundle), Code::bad_bundle);
+  };
+  CHECK(contains(refused_with("pad_id", 1 << 20), "a pad_id below"));
+  CHECK(contains(refused_with("max_tokens", 10), "at least the limit 10"));
+  CHECK(contains(refused_with("max_tokens", 1), "2 tokens or more, which stand around every text"));
+  CHECK(contains(refused_with("instructions", {"push", "push"}), "a list of different strings"));
+  CHECK(contains(refused_with("instructions", {""}), "that are not empty"));
+}
+
 TEST_CASE("a prompt that ops would blow up is refused before it is made") {
   EditableBundle bundle = sample();
   Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));

@@ -228,11 +228,29 @@ Status parse(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
+/// Instructions that have a limit of their own, whatever other ops make of them.
+Status parse_limit(JsonFields& fields, Recipe& recipe) {
+  if (recipe.max_tokens > 0) return misplaced(fields, "nothing after tokenize");
+  VLA_TRY(const int limit, fields.integer("max_tokens", 1, kMaxVector));
+  VLA_TRY(std::vector<std::string> instructions, fields.strings("instructions"));
+  for (std::string& instruction : instructions)
+    if (!recipe.limits.emplace(std::move(instruction), limit).second)
+      return fields.wrong("instructions", "instructions that no other limit names");
+  return {};
+}
+
 Status parse_tokenize(JsonFields& fields, Recipe& recipe) {
   if (recipe.max_tokens > 0) return misplaced(fields, "nothing after tokenize");
   VLA_TRY(recipe.max_tokens, fields.integer("max_tokens", 1, kMaxVector));
   VLA_TRY(const int truncate, fields.choice("truncate", {"right", "left"}));
   recipe.keep_last = truncate == 1;
+  if (fields.has("pad_id")) {
+    VLA_TRY(recipe.pad_id, fields.integer("pad_id", 0, 1 << 24));
+  }
+  for (const int limit : recipe.text_limits())
+    if (limit > recipe.max_tokens) return fields.wrong("max_tokens", fmt::format("at least the limit {}", limit));
+  if (recipe.views != nullptr && (recipe.pad_id || !recipe.limits.empty()))
+    return misplaced(fields, "tokenize without pad_id and limits after views");
   return {};
 }
 
@@ -248,6 +266,7 @@ Ops text_ops() {
           {"text", "ensure_suffix", parse<EnsureSuffixOp>},
           {"text", "template", parse<TemplateOp>},
           {"text", "views", parse<ViewsOp>},
+          {"text", "limit", parse_limit},
           {"text", "tokenize", parse_tokenize}};
 }
 
