@@ -10,6 +10,8 @@
 #include <limits>
 #include <numeric>
 
+#include "nn/tokens.h"
+
 namespace vla {
 namespace {
 
@@ -25,6 +27,14 @@ Tensor make_mask(Graph& g, const std::string& key, int n_key, int n_query, Sees 
   });
 }
 
+/// The index of each token's group.
+std::vector<int> groups_of(std::span<const int> group_sizes) {
+  std::vector<int> group;
+  for (std::size_t i = 0; i < group_sizes.size(); ++i)
+    group.insert(group.end(), static_cast<std::size_t>(group_sizes[i]), static_cast<int>(i));
+  return group;
+}
+
 }  // namespace
 
 Tensor attention(Graph& g, Tensor q, const std::vector<KeyValue>& segments, Tensor mask) {
@@ -35,13 +45,24 @@ Tensor attention(Graph& g, Tensor q, const std::vector<KeyValue>& segments, Tens
 }
 
 Tensor group_mask(Graph& g, std::span<const int> group_sizes) {
-  std::vector<int> group;  // of each token
-  for (std::size_t i = 0; i < group_sizes.size(); ++i)
-    group.insert(group.end(), static_cast<std::size_t>(group_sizes[i]), static_cast<int>(i));
+  const std::vector<int> group = groups_of(group_sizes);
   const int n = static_cast<int>(group.size());
   return make_mask(g, fmt::format("group_mask/{}", fmt::join(group_sizes, "/")), n, n, [&](int i, int j) {
     return group[static_cast<std::size_t>(j)] <= group[static_cast<std::size_t>(i)];
   });
+}
+
+Tensor apart_mask(Graph& g, std::span<const int> group_sizes) {
+  const std::vector<int> group = groups_of(group_sizes);
+  const int n = static_cast<int>(group.size());
+  return make_mask(g, fmt::format("apart_mask/{}", fmt::join(group_sizes, "/")), n, n, [&](int i, int j) {
+    return group[static_cast<std::size_t>(j)] == group[static_cast<std::size_t>(i)];
+  });
+}
+
+Tensor first_mask(Graph& g, int n_seen, int n_key, int n_query) {
+  return make_mask(g, fmt::format("first_mask/{}/{}/{}", n_seen, n_key, n_query), n_key, n_query,
+                   [&](int, int j) { return j < n_seen; });
 }
 
 Tensor causal_mask(Graph& g, int n_past, int n_query) {
@@ -65,6 +86,24 @@ Tensor copies_mask(Graph& g, const std::vector<int>& copies, int n_query) {
       for (const int n : copies) mask.push_back(static_cast<float>(std::log(static_cast<double>(n))));
     return mask;
   });
+}
+
+Tensor tanh_of(Graph& g, Tensor x) {
+  constexpr int kHead = 8;  // features of a head, all but the first zeros: every device has attention of eight
+  const std::int64_t n = x.dim(0) * x.dim(1);
+  const auto firsts = [&](const std::string& key, const std::vector<float>& numbers) {
+    const Shape shape = {kHead, static_cast<std::int64_t>(numbers.size()), 1, 1};
+    return g.constant(fmt::format("{}/{}", key, numbers.size()), shape, [&] {
+      std::vector<float> values(numbers.size() * kHead);
+      for (std::size_t i = 0; i < numbers.size(); ++i) values[i * kHead] = numbers[i];
+      return values;
+    });
+  };
+  const Tensor unit = firsts("tanh scale", std::vector<float>(static_cast<std::size_t>(n), std::sqrt(1.0f * kHead)));
+  const Tensor ends = g.add(op::Reshape{}, {firsts("tanh ends", {1, -1})}, {kHead, 1, 2, 1});
+  const Tensor asked = multiply(g, unit, g.add(op::Reshape{}, {x}, {1, n, 1, 1}));
+  const Tensor seen = attention(g, split_heads(g, asked, 1), {{ends, ends}}, {});
+  return g.add(op::Reshape{}, {slice_features(g, seen, 0, 1)}, x.shape());
 }
 
 Tensor split_heads(Graph& g, Tensor x, int n_head) {

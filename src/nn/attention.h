@@ -25,6 +25,12 @@ Tensor attention(Graph& g, Tensor q, const std::vector<KeyValue>& segments, Tens
 /// mask is [n, n] with n their sum. Source: lerobot policies/common/vla_utils.py make_att_2d_masks.
 Tensor group_mask(Graph& g, std::span<const int> group_sizes);
 
+/// The mask of consecutive groups of tokens that see their own group alone: [n, n].
+Tensor apart_mask(Graph& g, std::span<const int> group_sizes);
+
+/// The mask of `n_query` tokens that see the first `n_seen` of `n_key`: [n_key, n_query].
+Tensor first_mask(Graph& g, int n_seen, int n_key, int n_query);
+
 /// The mask of `n_query` tokens that see `n_past` earlier tokens, themselves, and those before them: [n_past + n_query,
 /// n_query].
 Tensor causal_mask(Graph& g, int n_past, int n_query);
@@ -34,6 +40,10 @@ Tensor causal_mask(Graph& g, const std::vector<bool>& seen);
 /// The mask of keys that stand for `copies[j]` equal keys each: ln(copies[j]), since exp(score + ln n) is n times
 /// exp(score). [copies.size(), n_query], or none if all are 1.
 Tensor copies_mask(Graph& g, const std::vector<int>& copies, int n_query);
+
+/// tanh of numbers within ±1e9, [d, n] -> the same shape: what attends to 1 by the score x and to -1 by -x sees
+/// (e^x - e^-x) / (e^x + e^-x). Source: torch tanh.
+Tensor tanh_of(Graph& g, Tensor x);
 
 /// [d_model, n, ...] -> [d_model / n_head, n_head, n, ...].
 Tensor split_heads(Graph& g, Tensor x, int n_head);

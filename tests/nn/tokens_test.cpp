@@ -82,6 +82,21 @@ TEST_CASE("a causal mask hides what comes later and what is never seen, from its
   CHECK(got == Values{0, kHidden, kHidden, 0, kHidden, kHidden, 0, kHidden, 0});
 }
 
+TEST_CASE("groups apart see themselves alone, and some tokens are seen by all") {
+  constexpr int kSizes[] = {1, 2};
+  const auto apart = run_graph([&](Graph& g) { return apart_mask(g, kSizes); });
+  CHECK(apart == Values{0, kHidden, kHidden, kHidden, 0, 0, kHidden, 0, 0});
+  const auto first = run_graph([](Graph& g) { return first_mask(g, 1, 2, 3); });
+  CHECK(first == Values{0, kHidden, 0, kHidden, 0, kHidden});
+}
+
+TEST_CASE("tanh is within 2^-22 of the exact one, and one of its sign where float32 has no other number") {
+  const Values x = {0, 1e-6f, -0.01f, 0.5f, -1, 3, -9, 40, -1e8f, 1e8f};
+  const auto got = run_graph([&](Graph& g) { return tanh_of(g, test::constant(g, x, {5, 2})); });
+  REQUIRE(got.size() == x.size());
+  for (std::size_t i = 0; i < x.size(); ++i) CHECK(std::abs(got[i] - std::tanh(static_cast<double>(x[i]))) <= 0x1p-22);
+}
+
 TEST_CASE("a key that stands for several weighs like that many") {
   const Values q = {0.3f, -1.2f}, k = {0.5f, 0.1f, -0.7f, 2.0f, -0.7f, 2.0f, -0.7f, 2.0f},
                v = {1, 2, 5, -4, 5, -4, 5, -4};
