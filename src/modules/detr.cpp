@@ -21,10 +21,10 @@ DetrFamily DetrFamily::read(const Scope& s) {
   return family;
 }
 
-Tensor PlacedAttention::operator()(Graph& g, Tensor x, Tensor position) const {
+Tensor PlacedAttention::operator()(Graph& g, Tensor x, Tensor position, Tensor mask) const {
   return norm_(g, x, [&](Tensor h) {
     const Tensor x_placed = placed(g, h, position);
-    return attention_(g, x_placed, {}, {attention_.project()(g, x_placed, h, {})});
+    return attention_(g, x_placed, {}, {attention_.project()(g, x_placed, h, {})}, mask);
   });
 }
 
@@ -34,8 +34,8 @@ DetrEncoderLayer::DetrEncoderLayer(const Scope& s, const DetrFamily& family)
       ffn_norm_(s / "ffn_norm", family),
       mlp_(s, family.d_model, family.d_ff, family.activation) {}
 
-Tensor DetrEncoderLayer::forward(Graph& g, Tensor x, Tensor position) const {
-  return ffn_norm_(g, among_(g, x, position), [&](Tensor h) { return mlp_(g, h); });
+Tensor DetrEncoderLayer::forward(Graph& g, Tensor x, Tensor position, Tensor mask) const {
+  return ffn_norm_(g, among_(g, x, position, mask), [&](Tensor h) { return mlp_(g, h); });
 }
 
 DetrDecoderLayer::DetrDecoderLayer(const Scope& s, const DetrFamily& family)

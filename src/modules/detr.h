@@ -40,8 +40,8 @@ class PlacedAttention {
  public:
   PlacedAttention(const Scope& s, const DetrFamily& family)
       : norm_(s / "attn_norm", family), attention_(s, family.d_model, family.d_model, heads(family)) {}
-  /// x, position [d_model, n] -> [d_model, n].
-  Tensor operator()(Graph& g, Tensor x, Tensor position) const;
+  /// x, position [d_model, n], mask [n, n] or none -> [d_model, n].
+  Tensor operator()(Graph& g, Tensor x, Tensor position, Tensor mask = {}) const;
   static Heads heads(const DetrFamily& family) { return Heads::even(family.d_model, family.n_head); }
 
  private:
@@ -49,12 +49,13 @@ class PlacedAttention {
   Attention attention_;
 };
 
-/// Self-attention and an MLP. x, position [d_model, n] -> [d_model, n].
-/// Sources: lerobot policies/act/modeling_act.py ACTEncoderLayer; transformers modeling_bert.py BertLayer.
+/// Self-attention and an MLP. x, position [d_model, n], mask [n, n] or none -> [d_model, n].
+/// Sources: lerobot policies/act/modeling_act.py ACTEncoderLayer; transformers modeling_bert.py BertLayer; TurboVLA
+/// turbovla/models/components/transformer.py TransformerEncoderLayer.
 class DetrEncoderLayer : public Module<DetrEncoderLayer> {
  public:
   DetrEncoderLayer(const Scope& s, const DetrFamily& family);
-  Tensor forward(Graph& g, Tensor x, Tensor position) const;
+  Tensor forward(Graph& g, Tensor x, Tensor position, Tensor mask = {}) const;
 
  private:
   PlacedAttention among_;
@@ -64,7 +65,7 @@ class DetrEncoderLayer : public Module<DetrEncoderLayer> {
 
 /// Self-attention of queries, attention to the encoder's tokens (`cross`), and an MLP.
 /// Sources: lerobot policies/act/modeling_act.py ACTDecoderLayer; lerobot_policy_turbovla action_decoder.py
-/// TurboVLADecoderLayer.
+/// TurboVLADecoderLayer; torch.nn.TransformerDecoderLayer.
 class DetrDecoderLayer : public Module<DetrDecoderLayer> {
  public:
   DetrDecoderLayer(const Scope& s, const DetrFamily& family);

@@ -25,9 +25,9 @@ Status BartEncoder::check(int n_token) const {
                std::to_string(n_position_)};
 }
 
-Tensor BartEncoder::operator()(Graph& g, Tensor x) const {
-  x = norm_(g, add(g, x, position_(g, arange(g, static_cast<int>(x.dim(1))))));
-  for (const DetrEncoderLayer& layer : layers_) x = layer(g, x, Tensor());
+Tensor BartEncoder::operator()(Graph& g, Tensor x, Tensor positions, Tensor mask) const {
+  x = norm_(g, add(g, x, position_(g, positions)));
+  for (const DetrEncoderLayer& layer : layers_) x = layer(g, x, Tensor(), mask);
   return x;
 }
 

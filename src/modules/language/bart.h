@@ -16,8 +16,10 @@ class BartEncoder {
   explicit BartEncoder(const Scope& s);
 
   const Embedding& token() const { return token_; }
-  /// x [d_model, n] -> the same shape.
-  Tensor operator()(Graph& g, Tensor x) const;
+  /// x [d_model, n] -> the same shape, at positions 0 to n - 1.
+  Tensor operator()(Graph& g, Tensor x) const { return (*this)(g, x, arange(g, static_cast<int>(x.dim(1))), {}); }
+  /// The same at positions [n] i32; mask [n, n] or none.
+  Tensor operator()(Graph& g, Tensor x, Tensor positions, Tensor mask) const;
   /// Errors: bad_bundle for more tokens than positions.
   Status check(int n_token) const;
 

@@ -14,8 +14,4 @@ Status Bert::check(int n_text) const {
                fmt::format("at most {} tokens (lm.n_position)", encoder_.n_position()), std::to_string(n_text)};
 }
 
-Tensor Bert::operator()(Graph& g, Tensor ids) const {
-  return encoder_(g, add(g, encoder_.token()(g, ids), g.parameter(sentence_)));
-}
-
 }  // namespace vla

@@ -11,7 +11,7 @@
 
 namespace vla {
 
-DinoV3::DinoV3(const Scope& s)
+DinoV3::DinoV3(const Scope& s, bool normed)
     : d_model_(s.dim("d_model")),
       n_head_(s.dim("n_head", 1024)),
       image_size_(s.dim("image_size", 16384)),
@@ -19,8 +19,8 @@ DinoV3::DinoV3(const Scope& s)
       n_register_(s.index("n_register", 1024)),
       rope_base_(s.number("rope_base", kRopeBase)),
       class_token_((s / "class_token").vector("weight", d_model_)),
-      patch_embed_(s / "patch_embed", s.dim("patch_size", 256), d_model_),
-      post_norm_(s / "post_norm", d_model_, s.number("norm_eps", kNormEps)) {
+      patch_embed_(s / "patch_embed", s.dim("patch_size", 256), d_model_) {
+  if (normed) post_norm_.emplace(s / "post_norm", d_model_, s.number("norm_eps", kNormEps));
   const int d_ff = s.dim("d_ff"), n_layer = s.n_layer("n_layer");
   s.require(d_model_ % (4 * n_head_) == 0, "n_head",
             fmt::format("a divisor of d_model {} that leaves heads of a multiple of 4", d_model_),
@@ -44,7 +44,8 @@ Tensor DinoV3::operator()(Graph& g, Tensor images) const {
   const int n_first = 1 + n_register_;
   const Tensor rotary = centre_rotary_table(g, d_model_ / n_head_, rope_base_, n_first, n_side_, n_side_);
   for (const EncoderBlock& block : blocks_) x = block(g, x, rotary);
-  return post_norm_(g, slice_tokens(g, x, n_first, n_patch()));
+  const Tensor seen = slice_tokens(g, x, n_first, n_patch());
+  return post_norm_ ? (*post_norm_)(g, seen) : seen;
 }
 
 }  // namespace vla

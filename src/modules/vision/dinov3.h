@@ -15,7 +15,8 @@ namespace vla {
 /// DINOv3ViTModel.
 class DinoV3 {
  public:
-  explicit DinoV3(const Scope& s);
+  /// `normed`: whether the patches pass the tower's last norm, else they are those of the last block.
+  explicit DinoV3(const Scope& s, bool normed = true);
 
   /// images [side, side, 3, n_view], standardized -> [d_model, n_patch, n_view]. `check` must have accepted the size.
   Tensor operator()(Graph& g, Tensor images) const;
@@ -33,7 +34,7 @@ class DinoV3 {
   PatchEmbed patch_embed_;
   std::optional<Embedding> registers_;
   std::vector<EncoderBlock> blocks_;
-  LayerNorm post_norm_;
+  std::optional<LayerNorm> post_norm_;
 };
 
 }  // namespace vla
