@@ -55,6 +55,7 @@ Plan::Plan(const Network& network, const InputShape& shape, const PlanContext& c
       keep_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
       pull_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
       views_(shape.views),
+      text_(shape.text),
       cache_(network.constants),
       injection_(context.injected, slots_) {}
 
@@ -79,7 +80,7 @@ Status Plan::lower(const Network& network, const PlanContext& context) {
   Graph prefix(slots_, prefix_filter(tap_pattern_), injection_.of_prefix());
   Graph step(slots_, step_filter(tap_pattern_, network.solver.n_step), injection_.of_step(network.solver.n_step));
   const auto input = [&](const Slot* slot) { return slot != nullptr ? prefix.input(slot) : Tensor(); };
-  network.policy.prefix(prefix, {input(images_), input(tokens_), input(state_), views_}, cache_);
+  network.policy.prefix(prefix, {input(images_), input(tokens_), input(state_), views_, text_}, cache_);
   const Tensor x = step.input(x_), k = step.input(k_);
   const Tensor condition = network.conditions != nullptr ? column(step, step.input(network.conditions), k) : Tensor();
   Tensor answer = network.policy.velocity(step, x, condition, cache_);

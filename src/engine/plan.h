@@ -94,6 +94,7 @@ class Plan {
   // leftover.
   Slot *images_, *tokens_, *state_, *x_, *k_, *start_, *target_, *keep_, *pull_;
   std::uint64_t views_;
+  TextLayout text_;
   Cache cache_;
   Injection injection_;
   int i_step_ = 0;  // the program that runs or ran last

@@ -106,7 +106,8 @@ InputShape Robot::shape_of(const EncodedObservation& observation) const {
           .n_text = static_cast<int>(in.tokens.size()),
           .d_state = d_state_,
           .views = view_key(in.views),
-          .steered = observation.steering.has_value()};
+          .steered = observation.steering.has_value(),
+          .text = policy_->text_layout(in.tokens)};
 }
 
 /// The key for views in a shape: two shapes are equal if the policy builds the same graph.

@@ -15,12 +15,22 @@
 
 namespace vla {
 
-/// One observation, as the processor encodes it and the prefix reads it. It has no absent views and no text padding.
+/// What of a text, beside its length, the graph of a policy depends on. Without sentences it is one, without padding.
+struct TextLayout {
+  int n_seen = 0;  // tokens before the padding
+  std::vector<int>
+      sentences;  // sizes of groups of tokens that see their own group alone, those of the padding among them
+  auto operator<=>(const TextLayout&) const = default;
+};
+
+/// One observation, as the processor encodes it and the prefix reads it. It has no absent views, and no text padding
+/// but where the recipe adds it.
 struct PrefixInputs {
   Tensor images;            // [width, height, 3, n_view], in the image recipe's range
   Tensor tokens;            // [n_text] i32; none if the policy reads no instruction
   Tensor state;             // [d_state, 1], normalized and padded; none if policy.d_state is 0
   std::uint64_t views = 0;  // bit i: view i of the bundle is present; 0 if only the number of views matters
+  TextLayout text = {};
 };
 
 /// The sizes of PrefixInputs. There is one plan for each.
@@ -28,6 +38,7 @@ struct InputShape {
   int width = 0, height = 0, n_view = 0, n_text = 0, d_state = 0;
   std::uint64_t views = 0;  // as PrefixInputs::views
   bool steered = false;     // whether the solver continues a previous chunk
+  TextLayout text = {};
   auto operator<=>(const InputShape&) const = default;
 };
 
@@ -44,7 +55,8 @@ class Policy {
  public:
   virtual ~Policy() = default;
 
-  /// Checks at load that the network is defined for inputs of this size. Errors: bad_bundle, unsupported.
+  /// Checks at load that the network is defined for inputs of this size. Errors: bad_bundle, unsupported;
+  /// bad_observation for a layout that no text has.
   virtual Status check(const InputShape& shape) const = 0;
 
   /// Load rate: computes what depends on time only, one column per solver step: [d, times.size()]. None if the network
@@ -56,6 +68,12 @@ class Policy {
 
   /// Whether it matters which views are present, or only how many.
   virtual bool depends_on_which_views() const { return false; }
+
+  /// What of these tokens the graph depends on, beside their number.
+  virtual TextLayout text_layout(std::span<const std::int32_t> tokens) const {
+    static_cast<void>(tokens);
+    return {};
+  }
 
   virtual RealTimeChunking real_time_chunking() const { return {}; }
 

@@ -29,14 +29,18 @@ std::pair<std::string, ActShape> entry_of(const ordered_json& json) {
                                    {"state", &in.d_state}})
     json.at(key).get_to(*value);
   json.at("which_views").get_to(in.views), json.at("continues").get_to(in.steered);
+  if (json.contains("sentences"))
+    json.at("sentences").get_to(in.text.sentences), json.at("seen_tokens").get_to(in.text.n_seen);
   return {json.at("bundle").get<std::string>(), act};
 }
 
 ordered_json json_of(const std::string& bundle, const ActShape& act) {
   const InputShape& in = act.inputs;
-  return {{"bundle", bundle},    {"embodiment", act.embodiment}, {"width", in.width},
-          {"height", in.height}, {"views", in.n_view},           {"tokens", in.n_text},
-          {"state", in.d_state}, {"which_views", in.views},      {"continues", in.steered}};
+  ordered_json json = {{"bundle", bundle},    {"embodiment", act.embodiment}, {"width", in.width},
+                       {"height", in.height}, {"views", in.n_view},           {"tokens", in.n_text},
+                       {"state", in.d_state}, {"which_views", in.views},      {"continues", in.steered}};
+  if (!in.text.sentences.empty()) json["sentences"] = in.text.sentences, json["seen_tokens"] = in.text.n_seen;
+  return json;
 }
 
 }  // namespace
