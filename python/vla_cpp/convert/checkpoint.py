@@ -5,6 +5,7 @@ whose layout it is: LeRobot's, openpi's, or that of an architecture's authors.""
 
 from __future__ import annotations
 
+import glob
 import os
 from dataclasses import dataclass, field
 from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Tuple
@@ -112,9 +113,13 @@ class Layout(NamedTuple):
     name: str  # whose it is, as in "a checkpoint of ..."
     options: Tuple[Option, ...]  # what such a checkpoint leaves open, of what others state or do not have
     model_types: Tuple[str, ...] = ()  # what config.json states as model_type
-    files: Tuple[str, ...] = ()  # any of them tells it, where config.json does not
+    files: Tuple[str, ...] = ()  # any of them tells it, where config.json does not; names or patterns
     read: Callable[[str, Problems], Tensors] = read_stored  # tensors of the folder, and those that share the memory of one
     about: str = ""  # a paragraph of `vla-convert --help`
+    has_config: bool = True  # whether there is a config.json
+
+    def tells(self, folder: str) -> bool:
+        return any(glob.glob(os.path.join(glob.escape(folder), name)) for name in self.files)
 
 
 def clean(name: str) -> str:
@@ -145,7 +150,8 @@ def open_checkpoint(source: str, authors: Mapping[str, Layout], base: str = "") 
     has_assets = any(os.path.isdir(os.path.join(folder, name)) for name in ("assets", "params"))
     own = folder if os.path.exists(os.path.join(folder, "config.json")) or not below else below.folder
     has_config = os.path.exists(os.path.join(own, "config.json"))
-    config = read_json(os.path.join(own, "config.json")) if has_config or not has_assets else {}
+    states_sizes = has_assets or any(not each.has_config and each.tells(own) for each in authors.values())
+    config = read_json(os.path.join(own, "config.json")) if has_config or not states_sizes else {}
     layout = _layout(below.folder if below else folder, config, has_assets, authors)
     problems, notes = Problems(name), []
     read = authors[layout].read if layout in authors else read_stored
@@ -260,7 +266,7 @@ def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, L
         if config.get("model_type") in layout.model_types:
             return arch
     for arch, layout in authors.items():
-        if any(os.path.exists(os.path.join(folder, name)) for name in layout.files):
+        if layout.tells(folder):
             return arch
     return OPENPI if has_assets or "paligemma_variant" in config else LEROBOT
 

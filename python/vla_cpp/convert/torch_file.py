@@ -167,8 +167,8 @@ def _position(path: str, name: str, value, entries: Dict[str, Stored], root: str
     return Entry(name, storage.dtype, value.shape, path, stored.offset + value.first * item, n_element * item)
 
 
-def read_torch(path: str, member: str) -> Dict[str, Entry]:
-    """The tensors of the state dictionary that the file keeps under `member`, or is where that is empty; no tensor data is read."""
+def _content(path: str) -> Tuple[object, Dict[str, Stored], str]:
+    """What was saved, the entries of the archive, and the folder that they are in."""
     entries = _entries(path)
     roots = [name[: -len("data.pkl")] for name in entries if name.endswith("data.pkl") and name.count("/") == 1]
     if len(roots) != 1:
@@ -177,7 +177,18 @@ def read_torch(path: str, member: str) -> Dict[str, Entry]:
     if root + "byteorder" in entries and _read(path, entries[root + "byteorder"], path) != b"little":
         raise refuse(path + ": byteorder", "little", "another", "save the file on a little-endian machine")
     where = path + ": data.pkl"
-    content = read_pickle(_read(path, entries[root + "data.pkl"], where), where, CALLS, _storage)
+    return read_pickle(_read(path, entries[root + "data.pkl"], where), where, CALLS, _storage), entries, root
+
+
+def read_torch_value(path: str, member: str) -> object:
+    """What the file keeps under `member` beside tensors, None where it has no such member."""
+    content, _, _ = _content(path)
+    return content.get(member) if isinstance(content, dict) else None
+
+
+def read_torch(path: str, member: str) -> Dict[str, Entry]:
+    """The tensors of the state dictionary that the file keeps under `member`, or is where that is empty; no tensor data is read."""
+    (content, entries, root), where = _content(path), path + ": data.pkl"
     state = content.get(member) if isinstance(content, dict) and member else content
     if not isinstance(state, dict) or not state:
         expected = "a dictionary with the tensors" + (" under " + member if member else "")
