@@ -33,7 +33,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla, vla_jepa, xvla
+from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla, turbovla_authors, vla_jepa, xvla
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -189,6 +189,36 @@ def draw_turbovla(seed):
     checkpoint = turbovla.Checkpoint(vision, text, policy, {view: frame[:2] for view, frame in frames.items()}, r.choice((0, 1, 7, 20)), r.randint(1, 20),
                                      dtype=r.choice(("F32", "F32", "BF16")))
     return cases.Case(seed, frames, r.choice((*TEXTS, "Ouvre le TIROIR à côté de l'évier, 한국어 Ⅷ ﬁn", "[SEP]a[MASK] [cls]")), checkpoint)
+
+
+SENTENCES = ("open the drawer", "open the drawer. put the bowl inside", "close it? now. ", "put the bowl on the plate.", ". ? .", "[SEP] a [PAD] b [CLS]",
+             "word " * 40)
+
+
+def draw_turbovla_authors(seed):
+    """The same for TurboVLA of its authors: sentences, rows of padding, residuals, places."""
+    r = random.Random(f"turbovla_authors {seed}")
+    vision_heads, text_heads, heads, patch = r.choice((1, 2, 3)), r.choice((1, 2, 3, 5)), r.choice((1, 2, 3, 4, 6)), r.choice((4, 5, 8, 14))
+    side, n_position, n_view = patch * r.randint(1, 4), r.choice((20, 40)), r.randint(1, 3)
+    views = [f"cam{i}" for i in range(n_view)]
+    vision = turbovla.vision(4 * vision_heads * r.choice((2, 3, 5)), r.randint(1, 3), vision_heads, r.choice((20, 36, 50)), patch, r.choice((0, 1, 4, 4)),
+                             layer_norm_eps=r.choice((1e-5, 1e-6)), rope_theta=r.choice((100.0, 37.5)))
+    text = turbovla.text(4 * text_heads * r.choice((1, 2, 3)), r.randint(1, 3), text_heads, r.choice((20, 36, 50)), n_position)
+    words = r.choice((*TEXTS, *SENTENCES, *SENTENCES))
+    n_row = r.choice((None, r.randint(3, n_position), r.randint(10, n_position), n_position))
+    own = {words: r.randint(3, n_row), "another one": 3} if n_row and r.random() < 0.5 else {}
+    texts = {"max_length": n_row or r.randint(3, n_position), "padding_length": n_row, "padding_length_by_instruction": own,
+             "sub_sentence_present": r.random() < 0.8, "zero_padded_tokens": r.random() < 0.3}
+    style = {"padding_strategy": r.choice(("key_padding_mask", "zero_fill")), "residual_style": r.choice(("normalized", "pre_norm")),
+             "attention_backend": r.choice(("manual", "sdpa"))}
+    inner = 4 * max(1, heads // 2) * r.choice((1, 2, 5))
+    fusion = (4 * heads * max(1, heads // 2) * r.choice((1, 2)), heads, r.randint(1, 3), r.choice((20, 50)), inner, style)
+    action = (r.randint(1, 14), r.randint(1, 4), r.randint(1, 3), r.choice((16, 44)), r.choice((20, 36)))
+    parts = turbovla_authors.parts(side, fusion, action, texts, position_embedding=r.choice(("view", "learned_patch")),
+                                   encode_views_separately=r.random() < 0.5)
+    checkpoint = turbovla_authors.Checkpoint(vision, text, parts, tuple(views))
+    options = {"vision_tokens": turbovla_authors.tokens_read(), "views": views}
+    return cases.Case(seed, {view: (side, side, "png") for view in views}, words, checkpoint, options=options)
 
 
 def draw_vla_jepa(seed):
@@ -414,7 +444,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"act": draw_act, "turbovla": draw_turbovla, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
 

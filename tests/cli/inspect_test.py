@@ -103,6 +103,9 @@ def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
         "act/pre_norm": {"encoder.norm.weight", "encoder.norm.bias"},
         "xvla/joints": {"prompt.weight"},
         "turbovla/no_state": {"state_in.weight", "state_in.bias", "state_token.weight", "vision.registers.weight"},
+        "turbovla_authors/exact_fit": {"vision.registers.weight"},
+        "turbovla_authors/last_block": {"vision.post_norm.weight", "vision.post_norm.bias"},
+        "turbovla_authors/zero_fill": {"place.weight", "place_scale.weight"},
         "vla_jepa/camera": {f"state_{layer}.{kind}" for layer in ("in", "out") for kind in ("weight", "bias")},
     }
     assert without_numbers(bundle) == without_numbers(p["name"] for p in manifest["parameters"]) ^ other.get(name, set())

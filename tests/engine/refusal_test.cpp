@@ -146,6 +146,22 @@ TEST_CASE("TurboVLA is refused with fewer cameras than views, fewer positions th
   check_refused(bundle, Code::bad_bundle, "transformer.norm");
 }
 
+TEST_CASE("TurboVLA of its authors is refused with other views, fewer rows than tokens, or odd heads") {
+  const EditableBundle sound = EditableBundle::read(golden_path("turbovla_authors/two_views") + "/bundle.gguf");
+  const auto with = [&](const char* key, const Value& value) {
+    EditableBundle bundle = sound;
+    bundle.set(key, value);
+    return bundle;
+  };
+  check_refused(with("policy.n_row", Value(std::int64_t{27})), Code::bad_bundle, "1 to 27 tokens");
+  check_refused(with("fusion.n_head", Value(std::int64_t{5})), Code::bad_bundle, "fusion.n_head");
+  check_refused(with("policy.text_end", Value(std::int64_t{117})), Code::bad_bundle, "policy.text_end");
+  check_refused(with("policy.padding", Value(std::string("none"))), Code::bad_bundle, "policy.padding");
+  check_refused(with("policy.vision_tokens", Value(std::string("last_block"))), Code::bad_bundle,
+                "vision.post_norm.weight");
+  check_refused(with("policy.places", Value(std::string("patches"))), Code::bad_bundle, "place_scale.weight");
+}
+
 TEST_CASE(
     "VLA-JEPA is refused where its prompt has no room for the embodied tokens, or tensors belong to another head") {
   const EditableBundle sound = EditableBundle::read(golden_path("vla_jepa/libero") + "/bundle.gguf");

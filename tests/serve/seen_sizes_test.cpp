@@ -78,6 +78,22 @@ TEST_CASE("sizes of another bundle are left out, and those that an observation c
   CHECK(serve::warm_up(*engine, seen).ok());
 }
 
+TEST_CASE("sentences of a text are kept, and those that no text has are passed over") {
+  const File file;
+  const std::string folder = golden_path("turbovla_authors/two_views");
+  const auto engine = load_engine(folder + "/bundle.gguf");
+  REQUIRE(engine->act(GoldenCase::read(folder).observation, std::uint64_t{1}).ok());
+  open(file.path)->add(*engine);
+  const std::vector<ActShape> kept = open(file.path)->of(*engine);
+  REQUIRE(kept.size() == 1);
+  CHECK(kept.front() == *engine->last_shape());
+  CHECK(kept.front().inputs.text.sentences.size() > 1);
+  ActShape odd = kept.front();
+  odd.inputs.text.sentences.push_back(1);
+  CHECK(engine->warm_up(odd).error().code == Code::bad_observation);
+  CHECK(serve::warm_up(*engine, {odd}).ok());
+}
+
 TEST_CASE("a file that holds no sizes is refused with what to do") {
   const File file;
   for (const char* text : {"", "{", "[1]", R"([{"bundle": 3}])", "[{}]"}) {

@@ -89,9 +89,11 @@ def versions() -> str:
 
 
 def config_type(checkpoint) -> str:
-    """The architecture: LeRobot's config.json names it as its type, authors' files state a model_type; Evo-1's nothing."""
+    """The architecture: LeRobot's config.json names it as its type, authors' files state a model_type; Evo-1's nothing, TurboVLA's have none."""
     from vla_cpp.convert.archs import authors
 
+    if not (Path(checkpoint) / "config.json").is_file():
+        return next(arch for arch, layout in authors().items() if not layout.has_config and layout.tells(str(checkpoint)))
     config = json.loads((Path(checkpoint) / "config.json").read_text())
     return config.get("type") or next((arch for arch, layout in authors().items() if config.get("model_type") in layout.model_types), "evo1")
 
@@ -289,7 +291,7 @@ def read_taps(file):
 # Cases of which every tap is kept: one of each family, and all of BitVLA, whose parts are compared on the reference's own inputs.
 EVERY_TAP = {"act/pre_norm", "bitvla/micro", "bitvla/one_view", "bitvla/two_layers", "evo1/two_views", "gr00t_n1_5/percentiles",
              "gr00t_n1_6/aspect", "gr00t_n1_7/percentiles", "pi0/absent_view", "pi05/long_text", "smolvla/long_text",
-             "turbovla/long_text", "vla_jepa/three_views", "xvla/two_arms"}
+             "turbovla/long_text", "turbovla_authors/two_views", "vla_jepa/three_views", "xvla/two_arms"}
 
 
 def outline(taps):

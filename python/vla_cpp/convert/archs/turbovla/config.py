@@ -126,7 +126,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
         vision=read_vision(vision, policy.count("image_size"), vision.count("patch_size")),
         rope_base=vision.number("rope_theta"),
         n_register=vision.count("num_register_tokens", 0, 1023),
-        lm=_read_bert(text),
+        lm=read_bert(text),
         n_sentence=text.count("type_vocab_size"),
         lm_folder=folder,
     )
@@ -153,7 +153,7 @@ def _vision_config(policy: Section, checkpoint: Checkpoint) -> dict:
     return release(768, 12, 12)
 
 
-def _read_bert(text: Section) -> TextEncoder:
+def read_bert(text: Section) -> TextEncoder:
     bert = TextEncoder(
         d_model=text.count("hidden_size"),
         n_layer=text.count("num_hidden_layers", maximum=MAX_LAYERS),
