@@ -132,8 +132,13 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
   VLA_TRY(const int d_action, keys.integer("policy.d_action", kAnySize));
   VLA_TRY(const ViewPlaces places, view_places(keys, image));
   const int d_robot = std::min({kRobot, d_state > 0 ? d_state : kRobot, d_action});
+  int n_row = sizes.max_tokens;  // of a text
+  if (keys.has("policy.n_row")) {
+    VLA_TRY(n_row, keys.integer("policy.n_row", kAnySize));
+    if (n_row == 0) n_row = sizes.max_tokens;  // without a limit
+  }
   // A policy without a vocabulary reads no instruction.
-  const int max_tokens = keys.has("lm.n_vocab") ? places.count * places.size() + sizes.max_tokens : 0;
+  const int max_tokens = keys.has("lm.n_vocab") ? places.count * places.size() + std::min(sizes.max_tokens, n_row) : 0;
   std::vector<std::string> tokens = byte_tokens();
   if (places.count > 0) tokens.emplace_back(ViewPlaces::kToken);
   const std::vector<std::string> views = numbered("observation.images.view", sizes.n_view);
