@@ -3,11 +3,12 @@
 """Frames of cameras of any size, through every family and through its reference: the chunks are equal, or the runtime refuses.
 
     python tools/camera_sizes.py check [--count 500] [--only FAMILY]    random cameras; exit code 1 where an answer is wrong
-    python tools/camera_sizes.py record [--count 10]                    what the references answer, into tests/golden/camera_sizes.json
+    python tools/camera_sizes.py record [--count 10] [--only FAMILY]    what the references answer, into tests/golden/camera_sizes.json
 
 The policies are those of the golden cases (`python tools/goldens make`), the references theirs: an environment with torch and lerobot, and
 for the runtime a build whose libvla.so VLA_LIBRARY names. Cameras of one observation have one size half of the time, and each its own
-otherwise. A reference that fails has refused: then the runtime has to refuse as well.
+otherwise. A reference that fails has refused: then the runtime has to refuse as well. `turbovla_authors` needs an environment of its own
+(tools/goldens/turbovla_authors.py), and --only.
 """
 
 import argparse
@@ -108,7 +109,13 @@ def cases(only):
     """One of each family and of each way in which its pipeline may go: those of GR00T keep aspects or pad."""
     chosen = [name for name in all_cases() if name.split("/")[1] in
               ("two_views", "pre_norm", "lerobot", "modes", "libero", "aspect", "relative", "four_by_three", "camera", "small", "no_state")]
-    return [name for name in chosen if not only or name.split("/")[0] == only]
+    return [name for name in chosen if wanted(name, only)]
+
+
+def wanted(name, only):
+    """Without --only all families that run in this environment."""
+    family = name.split("/")[0]
+    return family == only if only else family != "turbovla_authors"
 
 
 def check(name, count, seed):
@@ -134,9 +141,10 @@ def check(name, count, seed):
     return not wrong
 
 
-def record(count, seed):
-    out = {}
-    for name in cases(None):
+def record(only, count, seed):
+    """What is not asked for stays as it is recorded."""
+    out = json.loads(RECORDED.read_text())
+    for name in cases(only):
         pair = Pair(name, runtime=False)
         random, rows = np.random.default_rng([seed, len(name)]), []
         for i in range(count):
@@ -166,7 +174,7 @@ def main():
 
     torch.set_num_threads(1)
     if args.command == "record":
-        record(args.count, args.seed)
+        record(args.only, args.count, args.seed)
         return
     good = True
     for name in cases(args.only):

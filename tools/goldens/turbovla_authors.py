@@ -280,6 +280,11 @@ class Reference:
         samples = {"dinov3": policy.dinov3_processor(pictures)["pixel_values"][None]}
         return batch["task"], *policy._prepare_model_inputs(samples, states)
 
+    def predict_action_chunk(self, batch, noise=None):
+        """Their evaluation predicts a chunk without noise."""
+        instruction, samples, states = batch
+        return self.model([instruction], samples, states)
+
     def after(self, chunk):
         import torch
 
