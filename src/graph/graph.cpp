@@ -69,7 +69,7 @@ Tensor Graph::constant(std::vector<float> values, const Shape& shape) {
 
 namespace {
 
-/// `path`, or where a value of the graph has it, because a module runs again, `path#2`, `path#3` and so on.
+/// `path`, or `path#2`, `path#3` and so on if a value has it already, because a module runs several times.
 std::string unused(const std::deque<Node>& nodes, const std::string& path) {
   std::string numbered = path;
   const auto has_it = [&](const Node& node) { return node.path == numbered; };
@@ -80,7 +80,7 @@ std::string unused(const std::deque<Node>& nodes, const std::string& path) {
 }  // namespace
 
 Tensor Graph::name(const std::string& of_module, Tensor value) {
-  // Paths are read where values are recorded or replaced: elsewhere a second one of a name does no harm.
+  // Only recording and replacing values reads paths, so only then must each be unique.
   const std::string path = filter_ || injector_ ? unused(nodes_, of_module) : of_module;
   if (const Slot* slot = injector_ ? injector_(path, value) : nullptr) value = input(slot);
   Node& node = *value.node();

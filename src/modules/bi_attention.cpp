@@ -26,19 +26,19 @@ BiAttention::Side::Side(const Scope& s, const Family& family)
       out(s / "attn_out", family.d_inner, family.d_model, Bias::yes),
       scale((s / "attn_scale").vector("weight", family.d_model)) {}
 
-KeyValue BiAttention::Side::told(Graph& g, Tensor normed, int n_head) const {
+KeyValue BiAttention::Side::project(Graph& g, Tensor normed, int n_head) const {
   const Tensor key = split_heads(g, score(g, normed), n_head);
   return {key, split_heads(g, value(g, normed), n_head)};
 }
 
-Tensor BiAttention::Side::add_to(Graph& g, Tensor x, Tensor seen) const {
-  return g.name(path, gated_add(g, x, out(g, seen), g.parameter(scale)));
+Tensor BiAttention::Side::add_to(Graph& g, Tensor x, Tensor attended) const {
+  return g.name(path, gated_add(g, x, out(g, attended), g.parameter(scale)));
 }
 
 Streams BiAttention::operator()(Graph& g, const Streams& x, int n_seen) const {
   const Streams normed = {image_.norm(g, x.image), text_.norm(g, x.text)};
-  const KeyValue image = image_.told(g, normed.image, family_.n_head);
-  const KeyValue text = text_.told(g, normed.text, family_.n_head);
+  const KeyValue image = image_.project(g, normed.image, family_.n_head);
+  const KeyValue text = text_.project(g, normed.text, family_.n_head);
   const KeyValue first = {slice_keys(g, text.key, 0, n_seen), slice_keys(g, text.value, 0, n_seen)};
   const Tensor of_text = attention(g, image.key, {first}, {}), of_image = attention(g, text.key, {image}, {});
   const Streams& base = family_.keeps_input ? x : normed;

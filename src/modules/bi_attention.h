@@ -9,14 +9,14 @@
 
 namespace vla {
 
-/// Two streams attend to each other by one table of scores: what an image token asks the text with is its key where the
-/// text asks. Every stream adds what it saw, scaled feature by feature. Source: TurboVLA
+/// Image and text attend to each other with one matrix of scores: one projection of a stream is its query and its key.
+/// Each stream adds its attention output, scaled by a factor per feature. Source: TurboVLA
 /// turbovla/models/components/fusion.py BiAttentionBlock, BiMultiHeadAttention.
 class BiAttention {
  public:
   struct Family {
     int d_model, d_inner, n_head;  // d_inner: width of all heads together
-    bool keeps_input;              // what was seen is added to the layer's input, else to its norm
+    bool keeps_input;              // the residual is the layer's input, else the norm of it
     float norm_eps;
 
     /// Reads n_head, d_inner and residual of `s`.
@@ -25,17 +25,17 @@ class BiAttention {
 
   BiAttention(const Scope& s, const Family& family)
       : family_(family), image_(s / "image", family), text_(s / "text", family) {}
-  /// Image tokens see the first `n_seen` text tokens; text tokens see all image tokens.
+  /// Image tokens attend to the first `n_seen` text tokens, text tokens to all image tokens.
   Streams operator()(Graph& g, const Streams& x, int n_seen) const;
 
  private:
   /// One stream's part.
   struct Side {
     Side(const Scope& s, const Family& family);
-    /// What tokens ask with and are found by, and what they tell: the norm of the stream through two projections.
-    KeyValue told(Graph& g, Tensor normed, int n_head) const;
-    /// `seen`: heads of what the stream saw.
-    Tensor add_to(Graph& g, Tensor x, Tensor seen) const;
+    /// Two projections of the stream's norm. The keys are its queries too.
+    KeyValue project(Graph& g, Tensor normed, int n_head) const;
+    /// Adds the attention output, [d_head, n_head, n], to x.
+    Tensor add_to(Graph& g, Tensor x, Tensor attended) const;
 
     std::string path;
     LayerNorm norm;

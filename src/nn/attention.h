@@ -25,7 +25,7 @@ Tensor attention(Graph& g, Tensor q, const std::vector<KeyValue>& segments, Tens
 /// mask is [n, n] with n their sum. Source: lerobot policies/common/vla_utils.py make_att_2d_masks.
 Tensor group_mask(Graph& g, std::span<const int> group_sizes);
 
-/// The mask of consecutive groups of tokens that see their own group alone: [n, n].
+/// The mask in which tokens attend to their own group only: [n, n]. Groups are consecutive.
 Tensor apart_mask(Graph& g, std::span<const int> group_sizes);
 
 /// The mask of `n_query` tokens that see the first `n_seen` of `n_key`: [n_key, n_query].
@@ -41,8 +41,8 @@ Tensor causal_mask(Graph& g, const std::vector<bool>& seen);
 /// exp(score). [copies.size(), n_query], or none if all are 1.
 Tensor copies_mask(Graph& g, const std::vector<int>& copies, int n_query);
 
-/// tanh of numbers within ±1e9, [d, n] -> the same shape: what attends to 1 by the score x and to -1 by -x sees
-/// (e^x - e^-x) / (e^x + e^-x). Source: torch tanh.
+/// tanh of numbers within ±1e9, [d, n] -> the same shape. It is an attention over the values 1 and -1 with the scores x
+/// and -x, which gives (e^x - e^-x) / (e^x + e^-x). Source: torch tanh.
 Tensor tanh_of(Graph& g, Tensor x);
 
 /// [d_model, n, ...] -> [d_model / n_head, n_head, n, ...].

@@ -15,16 +15,15 @@
 
 namespace vla {
 
-/// What of a text, beside its length, the graph of a policy depends on. Without sentences it is one, without padding.
+/// The parts of a text. A policy may need another graph for each. No sentences: the text is one, without padding.
 struct TextLayout {
-  int n_seen = 0;  // tokens before the padding
-  std::vector<int>
-      sentences;  // sizes of groups of tokens that see their own group alone, those of the padding among them
+  int n_seen = 0;              // tokens before the padding
+  std::vector<int> sentences;  // number of tokens in each; they attend to their own sentence only. Padding counts too
   auto operator<=>(const TextLayout&) const = default;
 };
 
-/// One observation, as the processor encodes it and the prefix reads it. It has no absent views, and no text padding
-/// but where the recipe adds it.
+/// One observation, as the processor encodes it and the prefix reads it: without absent views, and without padding of
+/// the text unless the recipe adds it.
 struct PrefixInputs {
   Tensor images;            // [width, height, 3, n_view], in the image recipe's range
   Tensor tokens;            // [n_text] i32; none if the policy reads no instruction
@@ -69,7 +68,7 @@ class Policy {
   /// Whether it matters which views are present, or only how many.
   virtual bool depends_on_which_views() const { return false; }
 
-  /// What of these tokens the graph depends on, beside their number.
+  /// The parts of the text that the graph depends on; none if it depends on the number of tokens only.
   virtual TextLayout text_layout(std::span<const std::int32_t> tokens) const {
     static_cast<void>(tokens);
     return {};

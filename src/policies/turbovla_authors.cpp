@@ -41,7 +41,8 @@ class SkipProjection : public Module<SkipProjection> {
   LayerNorm out_norm_;
 };
 
-/// The state as several tokens, each at its own place: [d_state, 1] -> [d_model, n_token]. Source: StateProjection.
+/// The state as several tokens, each with a learned position: [d_state, 1] -> [d_model, n_token]. Source:
+/// StateProjection.
 class StateTokens : public Module<StateTokens> {
  public:
   StateTokens(const Scope& s, int d_state, int d_model, float eps)
@@ -68,10 +69,10 @@ class StateTokens : public Module<StateTokens> {
 };
 
 class TurboVlaAuthors final : public Policy {
-  /// What becomes of the rows behind the text: they pass every layer, begin as zeros, or are zeros in every layer.
+  /// Rows after the text: every layer computes them, they are zeros before the first layer, or after every layer too.
   enum class Padding { kept, zeroed_first, zeroed };
 
-  int horizon_, n_view_, n_row_;  // n_row: rows of a text in the layers; 0: as many as it has tokens
+  int horizon_, n_view_, n_row_;  // n_row: text rows in the layers; 0: the number of tokens
   bool apart_, patch_places_;
   Padding padding_;
   std::vector<int> sentence_ends_;  // ids
@@ -83,7 +84,7 @@ class TurboVlaAuthors final : public Policy {
   Linear text_in_;
   Embedding camera_;
   std::optional<Embedding> place_;
-  const Param* place_scale_ = nullptr;  // of each view's places
+  const Param* place_scale_ = nullptr;  // one factor per view
   StateTokens state_in_;
   std::vector<BiAttention> fusion_;
   std::vector<DetrEncoderLayer> text_layers_;
@@ -145,13 +146,13 @@ class TurboVlaAuthors final : public Policy {
     return check_prefix(shape.n_view, vision_.n_patch(), n_row + state_in_.n_token());
   }
 
-  /// An end of a sentence sees what follows the one before it, and is seen by it; where no end follows, and at the
-  /// first and last place, a token sees itself alone. Behind the text's own end is padding. Source:
+  /// A sentence is the tokens up to an end token, which attend to each other. The first and the last token, and tokens
+  /// that no end token follows, attend to themselves only. Tokens after the last text_end are padding. Source:
   /// generate_masks_with_special_tokens.
   TextLayout text_layout(std::span<const std::int32_t> tokens) const override {
     const int n = static_cast<int>(tokens.size());
     TextLayout layout = {.n_seen = n, .sentences = {}};
-    int n_done = 0;  // tokens that have a sentence
+    int n_done = 0;  // tokens assigned to a sentence
     const auto alone_up_to = [&](int end) {
       layout.sentences.insert(layout.sentences.end(), static_cast<std::size_t>(end - n_done), 1);
       n_done = end;
@@ -168,7 +169,7 @@ class TurboVlaAuthors final : public Policy {
     return layout;
   }
 
-  /// Computes the queries' self-attention in the first layer, and what is added to the patches of all views.
+  /// Computes the queries' self-attention of the first layer, and the position embeddings of all patches.
   void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {
     cache.put(g, "queries", decoder_.front().among(g, query_(g, arange(g, horizon_)), {}));
     if (!place_) return;
@@ -211,7 +212,7 @@ class TurboVlaAuthors final : public Policy {
   }
 
  private:
-  /// What BERT makes of the tokens, with zeros up to n_row, through the projection: [d_model, n_row].
+  /// BERT's output, filled up with zeros to n_row, projected: [d_model, n_row].
   Tensor text_rows(Graph& g, Tensor tokens, const TextLayout& layout) const {
     const int n = static_cast<int>(tokens.dim(0));
     Tensor hidden;
@@ -233,7 +234,7 @@ class TurboVlaAuthors final : public Policy {
            n_seen > 0 && n_seen <= n_text;
   }
 
-  /// Rows behind the tokens see themselves alone.
+  /// Rows after the tokens attend to themselves only.
   static Tensor sentence_mask(Graph& g, const TextLayout& layout, int n_row) {
     std::vector<int> sizes = layout.sentences;
     const int n = std::accumulate(sizes.begin(), sizes.end(), 0);

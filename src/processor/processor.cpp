@@ -158,7 +158,7 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
     return Error{Code::internal, "instruction", "the state to be encoded before the text", "no state"};
   VLA_TRY(const std::string prompt, fill_prompt(text, inputs.discretized_state));
   if (text.empty()) inputs.notes.push_back("instruction: empty");
-  // Of a full stop nothing is left.
+  // The prompt of a full stop is that of an empty text, since punctuation is dropped.
   if (recipe_.drops_punctuation && !text.empty() && prompt == *fill_prompt(".", inputs.discretized_state))
     return bad_observation("instruction", "a letter, digit or white space",
                            "nothing but punctuation, which is dropped");

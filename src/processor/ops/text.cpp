@@ -228,7 +228,7 @@ Status parse(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// Instructions that have a limit of their own, whatever other ops make of them.
+/// Limits of single instructions, as the client sends them.
 Status parse_limit(JsonFields& fields, Recipe& recipe) {
   if (recipe.max_tokens > 0) return misplaced(fields, "nothing after tokenize");
   VLA_TRY(const int limit, fields.integer("max_tokens", 1, kMaxVector));
