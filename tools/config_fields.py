@@ -67,11 +67,20 @@ class Case:
         file = self.folder / "checkpoint" / which
         if which != WEIGHTS:
             file.write_text(json.dumps(content))
+            self.order_state(content)
             return
         import torch
 
         file.unlink(missing_ok=True)
         torch.save(read_weights(self.source / "checkpoint") | {"model_config": content}, file)
+
+    def order_state(self, content):
+        """The recorder hands a state of several parts over as one vector, in the order of GR00T's modality_keys."""
+        with contextlib.suppress(AttributeError, TypeError, KeyError):
+            for modes in content["processor_kwargs"]["modality_configs"].values():
+                state = {key: self.observation["state"][key] for key in modes["state"]["modality_keys"] if key in self.observation["state"]}
+                if len(state) == len(self.observation["state"]):
+                    (self.folder / "observation.json").write_text(json.dumps(self.observation | {"state": state}))
 
     def reference(self):
         """The chunk, or the exception's text."""
