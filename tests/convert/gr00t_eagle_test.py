@@ -235,6 +235,8 @@ REFUSED = {
         META, lambda c: c["my_arm"]["modalities"]["state"].update(x={"continuous": False})),
     "statistics.state.y.max: expected finite numbers, found None": (
         META, lambda c: c["my_arm"]["statistics"]["state"]["y"].pop("max")),
+    "statistics.state.y.mean: expected as many numbers as min: ": (
+        META, lambda c: c["my_arm"]["statistics"]["state"]["y"].update(mean=[0.0] * 9)),
     "modalities.video: expected one resolution for the cameras image, wrist_image": (
         META, lambda c: c["my_arm"]["modalities"]["video"].update(wrist_image={"resolution": [40, 31]})),
     "--embodiment my_arm: expected one of new_embodiment, oxe_droid": (DATA, lambda c: c.pop("projector_index")),

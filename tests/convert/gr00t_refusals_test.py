@@ -8,6 +8,7 @@ import pytest
 
 from tiny import REMOVED, changed, write_json
 from tiny_gr00t import HORIZON, OTHER, TAG, TinyGr00t
+from vla_cpp.convert.archs.gr00t.robot import NAMES
 from vla_cpp.convert.errors import Code
 
 @pytest.mark.parametrize("tag, found", [("", "none"), ("libero_sim", "libero_sim")])
@@ -102,6 +103,7 @@ BAD = {
         "kwargs/crop_fraction": REMOVED
     },
     "processor_config.json: image_target_size: expected a size": {"kwargs/image_target_size": None},
+    "processor_config.json: image_target_size: expected [side, side] or null": {"kwargs/image_target_size": [12, 12, 12], "kwargs/shortest_image_edge": 12},
     "processor_config.json: image_crop_size: expected a size within": {"kwargs/image_crop_size": [13, 13]},
     "processor_config.json: clip_outliers: expected true or false": {"kwargs/clip_outliers": "yes"},
     "arm.state: modality_keys: expected different names": {ARM + "state/modality_keys": ["x", "x"]},
@@ -118,6 +120,7 @@ BAD = {
     "statistics.json: arm: expected statistics, found none": {"statistics/" + TAG: REMOVED},
     "statistics.json: arm.state.x.q01: expected numbers, found none": {STATS + "state/x/q01": REMOVED},
     "statistics.json: arm.state.gripper: expected statistics of one shape, found (2,) and (1,)": {STATS + "state/gripper/q99": [1.0]},
+    "statistics.json: arm.action.x.mean: expected as many numbers as q01: 1, found [0.0, 0.0]": {STATS + "action/x/mean": [0.0, 0.0]},
     "statistics.json: arm.state.x.std: expected numbers, found none": {
         ARM + "state/mean_std_embedding_keys": ["x"],
         STATS + "state/x/std": REMOVED,
@@ -125,15 +128,12 @@ BAD = {
     "statistics.json: state: expected at most max_state_dim 11 numbers, found 12": {
         ARM + "state/sin_cos_embedding_keys": ["gripper"],
         "kwargs/apply_sincos_state_encoding": True,
-        STATS + "state/gripper/q01": [0.0] * 5,
-        STATS + "state/gripper/q99": [1.0] * 5,
-        STATS + "state/x/q01": [0.0] * 2,
-        STATS + "state/x/q99": [1.0] * 2,
+        **{STATS + "state/gripper/" + name: [0.0] * 5 for name in NAMES},
+        **{STATS + "state/x/" + name: [0.0] * 2 for name in NAMES},
     },
     "statistics.json: arm.action.x.q99: expected numbers that float32 holds, found 1e+39": {STATS + "action/x/q99": [1e39]},
     "statistics.json: state: expected at most max_state_dim 11 numbers, found 13": {
-        STATS + "state/gripper/q01": [0.0] * 12,
-        STATS + "state/gripper/q99": [1.0] * 12,
+        **{STATS + "state/gripper/" + name: [0.0] * 12 for name in NAMES},
     },
     "embodiment_id.json: arm: expected an index below max_num_embodiments 3, found 3": {"embodiments/" + TAG: 3},
     "embodiment_id.json: arm: expected an index below max_num_embodiments 3, found None": {

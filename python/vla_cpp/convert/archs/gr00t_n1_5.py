@@ -28,7 +28,7 @@ from .gr00t import head
 from .gr00t.eagle import EAGLE_2_5
 from .gr00t.images import STANDARDIZE, Images
 from .gr00t.plan import Parts, assemble, network_keys_of
-from .gr00t.robot import BINARY, ROBOT_OPTIONS, SIN_COS, Group, Robot, choose
+from .gr00t.robot import BINARY, ROBOT_OPTIONS, SIN_COS, Group, Robot, check_widths, choose
 from .gr00t.sizes import Sizes
 
 LAYOUT = Layout("GR00T N1.5", (*ROBOT_OPTIONS, variant("the data config, by name or as a JSON file")), model_types=("gr00t_n1_5",))
@@ -251,6 +251,7 @@ def _group(part: str, key: str, mode: Optional[str], metadata: dict, rotations: 
     if low.size != high.size:
         problems.add(where, "statistics of one width", "{} and {}".format(low.size, high.size))
         high = low
+    check_widths(where, member(table, key, dict, where), names, low.size, problems)
     group = Group(key, low.size, kind, low, high, part == "state" and mode == "q99")
     modalities = member(member(metadata, "modalities", dict, METADATA), part, dict, METADATA)
     described, place = member(modalities, key, dict, METADATA), "{}: modalities.{}.{}".format(METADATA, part, key)

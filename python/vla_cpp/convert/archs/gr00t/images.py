@@ -78,9 +78,9 @@ def _pair(processor: Section, key: str) -> int:
 
 
 def _edge(processor: Section) -> int:
+    target = _pair(processor, "image_target_size")
     if processor.get("shortest_image_edge") is not None:
         return processor.count("shortest_image_edge", maximum=MAX_SIDE)
-    target = _pair(processor, "image_target_size")
     if not target:
         processor.bad("image_target_size", "a size, since shortest_image_edge is null too")
     return target or 1

@@ -21,6 +21,7 @@ from ...section import Section
 PROCESSOR, STATISTICS, EMBODIMENTS = "processor_config.json", "statistics.json", "embodiment_id.json"
 DOCS = "docs/converting.md, GR00T"
 MODALITY = {"delta_indices", "modality_keys", "sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"}
+NAMES = {"min", "max", "mean", "std", "q01", "q99"}  # statistics of a key
 MAX_WIDTH = 1 << 16
 ROBOT_OPTIONS = (  # what every release leaves open
     Option(
@@ -113,6 +114,15 @@ def embodiment_index(checkpoint: Checkpoint, tag: str, built_in: Dict[str, int],
     return 0
 
 
+def check_widths(where: str, stated: dict, names: Sequence[str], width: int, problems: Problems) -> None:
+    """Checks the statistics of a key that are not used: LeRobot takes the key's width from the mean. They may have a row for each action."""
+    for name in sorted(NAMES.intersection(stated) - set(names)):
+        values = stated[name]
+        row = values[0] if isinstance(values, list) and values and isinstance(values[0], list) else values
+        if not isinstance(row, list) or len(row) != width:
+            problems.add("{}.{}".format(where, name), "as many numbers as {}: {}".format(names[0], width), str(values)[:80])
+
+
 class _Reader:
     def __init__(self, tag: str, config: dict, statistics: dict, processor: Section, problems: Problems) -> None:
         self.tag, self.config, self.problems, self.processor = tag, config, problems, processor
@@ -145,6 +155,7 @@ class _Reader:
         if found[0].shape != found[1].shape:
             self.problems.add(where, "statistics of one shape", "{} and {}".format(*(x.shape for x in found)))
             found[1] = found[0]
+        check_widths(where, stated, names, found[0].shape[-1], self.problems)
         if names == ("mean", "std") and (found[1] < 0).any():
             self.problems.add(where + ".std", "numbers >= 0", str(found[1].min()))
         return found
