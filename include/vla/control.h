@@ -187,17 +187,28 @@ class Limiter {
   double refuse_above() const noexcept { return refuse_above_; }
 
  private:
+  /// A way to rest: n + 1 accelerations, each a share of the way between bounds that the limits give them.
+  struct Stop {
+    double change = 0, share = 0;  // the acceleration before them
+    int n = -1;
+  };
+  /// A row of a chunk: its value, and what it changes.
+  struct Seen {
+    double place, velocity, change;
+  };
   struct Motion {
     Column column;
     bool is_place = false;
     double low = 0, high = 0, slowest = 0, fastest = 0, acceleration = 0, jerk = 0;  // per step
     double place = 0, velocity = 0, change = 0;
-    double rounding = 0;              // of a chunk's values and their differences, which are float32
-    std::vector<double> stop, tried;  // accelerations of a stop
-    std::size_t stop_at = 0, stop_size = 0;
+    Seen seen = {};
+    double rounding = 0;         // of a chunk's values and their differences, which are float32
+    Stop stop;                   // from the last command
+    int n_stop = 0, n_gone = 0;  // steps of a stop that was found last; of `stop`, those that were commanded
   };
   static double step_column(Motion& motion, double wanted) noexcept;
-  static int find_stop(Motion& motion, double change) noexcept;
+  static bool find_stop(Motion& motion, double change, Stop& stop) noexcept;
+  static bool find_steps(Motion& motion, double velocity, Stop& stop) noexcept;
   std::vector<Motion> motions_;
   double refuse_above_;
 };

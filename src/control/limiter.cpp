@@ -12,9 +12,9 @@
 namespace vla::control {
 namespace {
 
-constexpr int kHalf = 16;       // halvings of the search for a permitted command
-constexpr int kMaxStop = 4096;  // steps of the longest stop that is looked for
-constexpr double kUnlimited = 1e9, kSlack = 1e-9;
+constexpr int kHalf = 16;         // halvings, at most, of the search for a permitted command
+constexpr int kMostSteps = 8191;  // of the longest stop that is looked for
+constexpr double kUnlimited = 1e9, kSlack = 1e-9, kRounding = 1e-12;
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 double clip(double x, double low, double high) { return std::min(std::max(x, low), high); }
@@ -26,23 +26,12 @@ double least_sum(double most, double jerk, double change, double n) {
   return fall * change - jerk * (fall * (fall + 1) / 2 + rise * (rise + 1) / 2) - (n - fall - rise) * most;
 }
 
-/// The least number of steps to rest; -1 beyond kMaxStop.
-int least_steps(double most, double jerk, double velocity, double change) {
-  const auto is_enough = [&](int steps) {
-    const double n = steps, slack = kSlack * (1 + std::abs(velocity));
-    return std::abs(change) <= (n + 1) * jerk + kSlack && least_sum(most, jerk, change, n) <= -velocity + slack &&
-           -least_sum(most, jerk, -change, n) >= -velocity - slack;
-  };
-  int few = -1, many = 0;
-  while (!is_enough(many)) {
-    if (many >= kMaxStop) return -1;
-    few = many, many = 2 * many + 1;
-  }
-  while (many - few > 1) {
-    const int middle = std::max((few + many) / 2, 0);
-    (is_enough(middle) ? many : few) = middle;
-  }
-  return many;
+/// The acceleration of step i of a stop of n + 1 steps.
+inline double step_of(double most, double jerk, double change, double share, double n, double i) {
+  const double forth = i * jerk, back = (n + 1 - i) * jerk;
+  const double low = std::max(std::max(-most, change - forth), -back);
+  const double high = std::min(std::min(most, change + forth), back);
+  return low + share * (high - low);
 }
 
 }  // namespace
@@ -65,7 +54,6 @@ Limiter::Limiter(const Limits& limits, double rate_hz) : refuse_above_(limits.re
     m.fastest = m.is_place ? step : std::min(high, step);
     m.acceleration = std::min(acceleration, 2 * (m.fastest - m.slowest) + kSlack);
     m.jerk = std::min(jerk, 2 * m.acceleration);
-    m.stop.resize(2 * kMaxStop + 2), m.tried.resize(2 * kMaxStop + 2);
     motions_.push_back(std::move(m));
   }
   reset();
@@ -75,7 +63,8 @@ void Limiter::reset() noexcept {
   for (Motion& m : motions_) {
     m.place = m.is_place ? std::numeric_limits<double>::quiet_NaN() : 0;
     m.velocity = m.change = 0;
-    m.stop_at = m.stop_size = 0;
+    m.stop = {};
+    m.n_stop = m.n_gone = 0;
   }
 }
 
@@ -99,39 +88,62 @@ void Limiter::rest_at(std::span<const double> values) {
   for (std::size_t i = 0; i < motions_.size(); ++i) motions_[i].place = motions_[i].is_place ? values[i] : 0;
 }
 
-/// Looks for a stop after a step with this acceleration. Returns its size, and its accelerations in `tried`; -1 for
-/// none.
-int Limiter::find_stop(Motion& m, double change) noexcept {
-  const double velocity = m.velocity + change, place = m.is_place ? m.place + velocity : 0;
-  const int n = least_steps(m.acceleration, m.jerk, velocity, change);
-  if (n < 0) return -1;
-  const auto bounds = [&](int i) {
-    const double forth = i * m.jerk, back = std::max(n + 1 - i, 0) * m.jerk;
-    return std::pair{std::max(std::max(-m.acceleration, change - forth), -back),
-                     std::min(std::min(m.acceleration, change + forth), back)};
+/// Finds the least number of steps of a stop, and its share: false beyond kMostSteps. A stop of n steps is one of n + 1
+/// too, so it looks near the one found before first.
+bool Limiter::find_steps(Motion& m, double velocity, Stop& stop) noexcept {
+  const double slack = kSlack * (1 + std::abs(velocity)), change = stop.change;
+  double least = 0, most = 0;  // sums of the least and of the largest accelerations
+  const auto is_enough = [&](int n) {
+    if (!(std::abs(change) <= (n + 1.0) * m.jerk * (1 + kRounding))) return false;
+    least = least_sum(m.acceleration, m.jerk, change, n);
+    if (!(least <= -velocity + slack)) return false;
+    most = -least_sum(m.acceleration, m.jerk, -change, n);
+    return most >= -velocity - slack;
   };
-  double lows = 0, room = 0;
-  for (int i = 1; i <= n + 1; ++i) {
-    const auto [low, high] = bounds(i);
-    lows = i == 1 ? low : lows + low;
-    room = i == 1 ? high - low : room + (high - low);
+  int few = m.n_stop - 1, many = m.n_stop, stride = 1;
+  if (is_enough(many)) {
+    while (few >= 0 && is_enough(few)) many = few, few = std::max(few - stride, -1), stride *= 2;
+  } else {
+    do {
+      if (many >= kMostSteps) return false;
+      few = many, many = std::min(many + stride, kMostSteps), stride *= 2;
+    } while (!is_enough(many));
   }
-  const double share = clip(room > 0 ? (-velocity - lows) / room : 0, 0, 1);
+  while (many - few > 1) {
+    const int middle = few + (many - few) / 2;
+    (is_enough(middle) ? many : few) = middle;
+  }
+  is_enough(many);  // its sums
+  m.n_stop = stop.n = many;
+  const double room = most - least;
+  stop.share = clip(room > 0 ? (-velocity - least) / room : 0, 0, 1);
+  return true;
+}
+
+/// Looks for the shortest stop after a step with this acceleration: false where none keeps the limits.
+bool Limiter::find_stop(Motion& m, double change, Stop& stop) noexcept {
+  const double velocity = m.velocity + change, place = m.is_place ? m.place + velocity : 0;
   const double slack = kSlack * (1 + std::abs(m.fastest)), edge = kSlack * (1 + (m.is_place ? std::abs(place) : 0.0));
-  const auto is_speed = [&](double speed) { return speed >= m.slowest - slack && speed <= m.fastest + slack; };
-  const auto is_within = [&](double at) { return !m.is_place || (at >= m.low - edge && at <= m.high + edge); };
-  bool found = is_speed(velocity) && is_within(place);
+  const double slowest = m.slowest - slack, fastest = m.fastest + slack;
+  const double least = m.low - edge, largest = m.high + edge;  // infinite where the value is no place
+  stop.change = change;
+  if (velocity < slowest || velocity > fastest || place < least || place > largest) return false;
+  if (!find_steps(m, velocity, stop)) return false;
+  // Accelerations of a stop change their sign once at most, from that of `change` to the other. After that, or without
+  // that, the speed falls to zero: no later one is larger, and the way that is left is at most that of this speed.
+  const bool is_straight = change * (2 * stop.share - 1) >= 0;
+  const double n = stop.n, most = m.acceleration, jerk = m.jerk, share = stop.share;
   double steps = 0, speeds = 0;
-  for (int i = 1; i <= n + 1; ++i) {
-    const auto [low, high] = bounds(i);
-    const double step = low + share * (high - low);
-    m.tried[static_cast<std::size_t>(i - 1)] = step;
+  for (double i = 1; i <= n + 1; ++i) {
+    const double step = step_of(most, jerk, change, share, n, i);
     steps = i == 1 ? step : steps + step;
     const double speed = velocity + steps;
     speeds = i == 1 ? speed : speeds + speed;
-    found = found && is_speed(speed) && is_within(place + speeds);
+    const double at = place + speeds, last = at + (n + 1 - i) * speed;
+    if (speed < slowest || speed > fastest || at < least || at > largest) return false;
+    if ((is_straight || step * change <= 0) && last >= m.low && last <= m.high) return true;
   }
-  return found ? n + 1 : -1;
+  return true;
 }
 
 /// The command of a column for a wanted value.
@@ -141,30 +153,32 @@ double Limiter::step_column(Motion& m, double wanted) noexcept {
       std::max(std::max(std::max(-m.acceleration, m.change - m.jerk), m.slowest - m.velocity), m.low - ahead);
   const double high =
       std::min(std::min(std::min(m.acceleration, m.change + m.jerk), m.fastest - m.velocity), m.high - ahead);
-  const double kept = m.stop_at < m.stop_size ? m.stop[m.stop_at] : 0;
+  Stop stop = m.stop;
+  const double kept =
+      m.n_gone > stop.n ? 0 : step_of(m.acceleration, m.jerk, stop.change, stop.share, stop.n, m.n_gone + 1);
   const bool is_inside = change >= low - kSlack * (1 + std::abs(low)) && change <= high + kSlack * (1 + std::abs(high));
   const double target = is_inside ? change : clip(change, std::min(low, kept), std::max(high, kept));
-  double best = target, near = 0, far = 1;
-  int size = find_stop(m, target);
-  if (size < 0) {  // as near to it as a search by halves finds; in the worst case the next step of the kept stop
+  double best = target;
+  bool is_found = find_stop(m, target, stop);
+  if (!is_found) {  // as near to it as a search by halves finds; in the worst case the next step of the kept stop
+    const double still = m.is_place ? ahead : m.velocity;
+    const auto command = [&](double step) { return static_cast<float>(still + step); };
+    double near = 0, far = 1, beyond = target;  // `beyond`: the nearest one that has no stop
     best = kept;
-    for (int i = 0; i < kHalf; ++i) {
+    for (int i = 0; i < kHalf && command(best) != command(beyond); ++i) {
       const double share = (near + far) / 2, tried = kept + share * (target - kept);
-      const int found = find_stop(m, tried);
-      if (found >= 0) {
-        best = tried, size = found, near = share;
-        std::swap(m.stop, m.tried);
-        m.stop_at = m.stop_size = 0;  // `stop` is the found one from here on, and `kept` is a copy
+      Stop found;
+      if (find_stop(m, tried, found)) {
+        best = tried, near = share, stop = found, is_found = true;
       } else {
-        far = share;
+        beyond = tried, far = share;
       }
     }
-    if (size < 0 && m.stop_at < m.stop_size) ++m.stop_at;
-    if (size >= 0) m.stop_at = 0, m.stop_size = static_cast<std::size_t>(size);
-  } else {
-    std::swap(m.stop, m.tried);
-    m.stop_at = 0, m.stop_size = static_cast<std::size_t>(size);
   }
+  if (is_found)
+    m.stop = stop, m.n_gone = 0;
+  else
+    m.n_gone = std::min(m.n_gone, m.stop.n) + 1;
   m.change = best;
   m.velocity += best;
   const double out = m.is_place ? m.place + m.velocity : m.velocity;
@@ -196,23 +210,21 @@ int Limiter::breaks(std::span<const float> rows, int& first) noexcept {
     for (std::size_t row = 0; row < n_row; ++row) most = std::max(most, std::abs(value(row, i)));
     motions_[i].rounding = 8 * static_cast<double>(std::numeric_limits<float>::epsilon()) * most;
   }
-  const auto is_broken = [&](std::size_t row, std::size_t i) {
-    const Motion& m = motions_[i];
-    const double rounding = m.rounding;
-    const auto velocity = [&](std::size_t r) {
-      return !m.is_place ? value(r, i) : r == 0 ? 0 : value(r, i) - value(r - 1, i);
-    };
-    const auto change = [&](std::size_t r) { return velocity(r) - (r == 0 ? 0 : velocity(r - 1)); };
-    if (m.is_place && (value(row, i) < m.low - rounding || value(row, i) > m.high + rounding)) return true;
-    if (velocity(row) < m.slowest - rounding || velocity(row) > m.fastest + rounding) return true;
-    const std::size_t known = m.is_place ? 2 : 1;  // row that has an acceleration: two velocities before it are known
-    if (row >= known && std::abs(change(row)) > m.acceleration + 2 * rounding) return true;
-    return row >= known + 1 && std::abs(change(row) - change(row - 1)) > m.jerk + 4 * rounding;
-  };
   for (std::size_t row = 0; row < n_row; ++row) {
-    bool broken = false;
-    for (std::size_t i = 0; i < d && !broken; ++i) broken = is_broken(row, i);
-    if (broken && n_broken++ == 0) first = static_cast<int>(row);
+    bool is_broken = false;
+    for (std::size_t i = 0; i < d; ++i) {
+      Motion& m = motions_[i];
+      const Seen before = row == 0 ? Seen{value(0, i), 0, 0} : m.seen;
+      const double place = value(row, i), velocity = m.is_place ? place - before.place : place;
+      const double change = velocity - before.velocity, rounding = m.rounding;
+      const std::size_t known = m.is_place ? 2 : 1;  // row that has an acceleration: two velocities before it are known
+      is_broken |= m.is_place && (place < m.low - rounding || place > m.high + rounding);
+      is_broken |= velocity < m.slowest - rounding || velocity > m.fastest + rounding;
+      is_broken |= row >= known && std::abs(change) > m.acceleration + 2 * rounding;
+      is_broken |= row >= known + 1 && std::abs(change - before.change) > m.jerk + 4 * rounding;
+      m.seen = {place, velocity, change};
+    }
+    if (is_broken && n_broken++ == 0) first = static_cast<int>(row);
   }
   return n_broken;
 }

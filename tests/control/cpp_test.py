@@ -205,7 +205,7 @@ def test_both_limiters_give_the_same_bytes():
         steps = rng.uniform(-2, 2, (40, len(names))) if rng.random() < 0.5 else np.cumsum(0.05 * rng.standard_normal((40, len(names))), 0)
         wanted = steps.astype(np.float32).astype(float).tolist()
         limits = limits_of(rng, names, 1.0)
-        scenarios.append({"kind": "limiter", "limits": limits, "rate_hz": float(rng.choice((5, 30, 200))), "wanted": wanted, "start": [0.0] * len(names)})
+        scenarios.append({"kind": "limiter", "limits": limits, "rate_hz": float(rng.choice((5, 30, 200, 1000))), "wanted": wanted, "start": [0.0] * len(names)})
     for scenario, found in zip(scenarios, in_cpp(scenarios)):
         limiter = Limiter(Limits.parse(scenario["limits"]), scenario["rate_hz"])
         limiter.rest_at(scenario["start"])

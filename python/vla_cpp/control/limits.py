@@ -33,11 +33,12 @@ from ..strict_json import no_constant, unique_names
 
 FORMAT = "vla-limits 1"
 KINDS = ("position", "velocity", "difference")
-N_HALF = 16  # halvings of the search for a permitted command
+N_HALF = 16  # halvings, at most, of the search for a permitted command
 MAX_STOP = 4096  # steps of the longest stop that is looked for
 MAX_FILE = 1 << 20  # bytes
 FAR = 1e9  # in place of a limit that is not given
 SLACK = 1e-9  # of rounding in double, relative to the limit
+ROUNDING = 1e-12  # of a product in double, and far below the slack
 
 
 @dataclass(frozen=True)
@@ -240,7 +241,10 @@ class Limiter:
         return low, high
 
     def _nearest(self, kept: np.ndarray, wanted: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
-        """The acceleration of each column that is nearest to the wanted one and has a stop, and these stops."""
+        """The acceleration of each column that is nearest to the wanted one and has a stop, and these stops.
+
+        The search ends where the nearest that has one and the nearest that has none are the same command.
+        """
         stops = self._stops(wanted)
         if stops.found.all():
             return wanted, stops.steps
@@ -248,14 +252,20 @@ class Limiter:
         best = np.where(stops.found, wanted, kept)
         plan = np.where(stops.found, _padded(stops.steps, n), _padded(self._stop[1:], n))
         near, far = np.where(stops.found, 1.0, 0.0), np.ones(len(wanted))  # shares of the way from kept to wanted
+        ahead = np.where(self._is_place, self._place + self._velocity, self._velocity)
+        beyond = wanted  # the nearest one that has none
         for _ in range(N_HALF):
+            is_open = (near < far) & ((ahead + best).astype(np.float32) != (ahead + beyond).astype(np.float32))
+            if not is_open.any():
+                break
             share = (near + far) / 2
             tried = kept + share * (wanted - kept)
             stops = self._stops(tried)
-            better = stops.found & (near < far)
+            better = stops.found & is_open
             n = max(n, len(stops.steps))
             best, plan = np.where(better, tried, best), np.where(better, _padded(stops.steps, n), _padded(plan, n))
-            near, far = np.where(better, share, near), np.where(better, far, share)
+            near = np.where(better, share, near)
+            far, beyond = np.where(is_open & ~better, share, far), np.where(is_open & ~better, tried, beyond)
         return best, plan
 
     def _stops(self, change: np.ndarray) -> Stops:
@@ -263,15 +273,16 @@ class Limiter:
 
         A stop of n steps has accelerations between the bounds that the limits give them, forwards from this one and backwards from
         rest, and a sum that takes the velocity away. Its bounds are convex, so a share between all lower and all upper ones keeps
-        them; a stop of n steps is one of n + 1 too, so the least n is found by halves.
+        them, and their sums say which; a stop of n steps is one of n + 1 too, so the least n is found by halves.
         """
         velocity = self._velocity + change
         place = np.where(self._is_place, self._place + velocity, 0.0)
         n = self._least_steps(velocity, change)
+        least, most = self._least_sum(change, n), -self._least_sum(-change, n)
+        room = most - least
+        share = np.clip(np.divide(-velocity - least, room, out=np.zeros_like(room), where=room > 0), 0, 1)
         low, high = self._bounds(change, n)
         after = np.arange(1, len(low) + 1)[:, None] > n + 1
-        room = _total(high - low)
-        share = np.clip(np.divide(-velocity - _total(low), room, out=np.zeros_like(room), where=room > 0), 0, 1)
         steps = low + share * (high - low)
         speeds = velocity + np.cumsum(steps, 0)
         places = place + np.cumsum(speeds, 0)
@@ -288,7 +299,7 @@ class Limiter:
 
         def enough(n: np.ndarray) -> np.ndarray:
             slack = SLACK * (1 + np.abs(velocity))
-            rests = np.abs(change) <= (n + 1) * self._jerk + SLACK
+            rests = np.abs(change) <= (n + 1) * self._jerk * (1 + ROUNDING)  # more would make n + 1 steps too few where n are enough
             return rests & (self._least_sum(change, n) <= -velocity + slack) & (-self._least_sum(-change, n) >= -velocity - slack)
 
         few, many = np.full(len(change), -1), np.zeros(len(change), int)
@@ -330,11 +341,6 @@ def finite_row(where: str, values: Any, n: int) -> np.ndarray:
     if row.shape != (n,) or not np.isfinite(row).all():
         raise BadAction(where, f"{n} finite numbers", str(values))
     return row
-
-
-def _total(rows: np.ndarray) -> np.ndarray:
-    """The sum of rows, added one after the other whatever their number, as the loop in C++ adds them."""
-    return np.cumsum(rows, 0)[-1]
 
 
 def _padded(steps: np.ndarray, n: int) -> np.ndarray:
