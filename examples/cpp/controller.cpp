@@ -45,7 +45,7 @@ class PolicyController {
     std::vector<Kind> kinds;
     bool is_place = true;
     for (const Column& column : options.limits->columns)
-      kinds.push_back(column.kind), is_place &= column.kind == Kind::position;
+      kinds.push_back(column.kind), is_place &= column.kind == Kind::position || column.kind == Kind::gripper;
     // Repeating the last command is right for positions alone; velocities and differences would keep the robot moving.
     options.late = is_place ? Late::hold : Late::zero;
     if (client_->spec().n_action_steps == 0) options.replan_every = (client_->spec().horizon + 1) / 2;

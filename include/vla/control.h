@@ -142,8 +142,9 @@ class Client : public Policy {
 
 // --- limits ----------------------------------------------------------------------------------------------------------
 
-/// position: a place. velocity: units per second. difference: units per control period.
-enum class Kind { position, velocity, difference };
+/// position: a place. velocity: units per second. difference: units per control period. gripper: an opening or a
+/// decision, which may jump and is never mixed with another; of its limits it has a range alone.
+enum class Kind { position, velocity, difference, gripper };
 
 /// Limits of an action column, in its unit and seconds; what has no value is not limited.
 struct Column {
@@ -185,6 +186,9 @@ class Limiter {
   /// of them.
   int breaks(std::span<const float> rows, int& first) noexcept;
   double refuse_above() const noexcept { return refuse_above_; }
+  bool is_gripper(std::size_t column) const noexcept { return motions_[column].is_gripper; }
+  /// What stands still where no column is a position: zeros, and of a gripper its last command.
+  void still(std::span<float> out) const noexcept;
 
  private:
   /// A way to rest: n + 1 accelerations, each a share of the way between bounds that the limits give them.
@@ -198,7 +202,7 @@ class Limiter {
   };
   struct Motion {
     Column column;
-    bool is_place = false;
+    bool is_place = false, is_gripper = false;
     double low = 0, high = 0, slowest = 0, fastest = 0, acceleration = 0, jerk = 0;  // per step
     double place = 0, velocity = 0, change = 0;
     Seen seen = {};
@@ -218,7 +222,7 @@ class Limiter {
 enum class Method { unset, linear, cubic, minimum_jerk };
 
 /// Commands within control periods, one period later than without it: positions follow a polynomial to the command,
-/// velocities are held, differences are spread. Formulas: python/vla_cpp/control/interpolate.py.
+/// velocities and grippers are held, differences are spread. Formulas: python/vla_cpp/control/interpolate.py.
 class Interpolator {
  public:
   /// Errors: usage.

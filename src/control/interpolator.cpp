@@ -76,9 +76,9 @@ bool Interpolator::at(double s, std::span<float> out) noexcept {
     const Motion& column = columns_[i];
     double now[3];
     motion(column, s, now);
-    const double value = column.kind == Kind::position   ? now[0]
-                         : column.kind == Kind::velocity ? column.command
-                                                         : (s - s_) * column.command;
+    const double value = column.kind == Kind::position     ? now[0]
+                         : column.kind == Kind::difference ? (s - s_) * column.command
+                                                           : column.command;
     out[i] = static_cast<float>(value);
   }
   s_ = s;

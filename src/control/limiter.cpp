@@ -42,6 +42,11 @@ Limiter::Limiter(const Limits& limits, double rate_hz) : refuse_above_(limits.re
   for (const Column& column : limits.columns) {
     Motion m;
     m.column = column, m.is_place = column.kind == Kind::position;
+    if (column.kind == Kind::gripper) {
+      m.is_gripper = true, m.low = column.low.value_or(-kInfinity), m.high = column.high.value_or(kInfinity);
+      motions_.push_back(std::move(m));
+      continue;
+    }
     const double first = column.kind == Kind::velocity ? 1.0 : 1 / rate_hz;
     const double low = column.low.value_or(-kUnlimited), high = column.high.value_or(kUnlimited);
     const double velocity = column.velocity.value_or(kInfinity) * first;
@@ -61,7 +66,7 @@ Limiter::Limiter(const Limits& limits, double rate_hz) : refuse_above_(limits.re
 
 void Limiter::reset() noexcept {
   for (Motion& m : motions_) {
-    m.place = m.is_place ? std::numeric_limits<double>::quiet_NaN() : 0;
+    m.place = m.is_place || m.is_gripper ? std::numeric_limits<double>::quiet_NaN() : 0;
     m.velocity = m.change = 0;
     m.stop = {};
     m.n_stop = m.n_gone = 0;
@@ -85,7 +90,13 @@ void Limiter::rest_at(std::span<const double> values) {
                   fmt::format("{:g}, where the robot is", values[i]));
   }
   reset();
-  for (std::size_t i = 0; i < motions_.size(); ++i) motions_[i].place = motions_[i].is_place ? values[i] : 0;
+  for (std::size_t i = 0; i < motions_.size(); ++i)
+    motions_[i].place = motions_[i].is_place || motions_[i].is_gripper ? values[i] : 0;
+}
+
+void Limiter::still(std::span<float> out) const noexcept {
+  for (std::size_t i = 0; i < motions_.size(); ++i)
+    out[i] = motions_[i].is_gripper ? static_cast<float>(motions_[i].place) : 0.0f;
 }
 
 /// Finds the least number of steps of a stop, and its share: false beyond kMostSteps. A stop of n steps is one of n + 1
@@ -148,6 +159,7 @@ bool Limiter::find_stop(Motion& m, double change, Stop& stop) noexcept {
 
 /// The command of a column for a wanted value.
 double Limiter::step_column(Motion& m, double wanted) noexcept {
+  if (m.is_gripper) return m.place = clip(wanted, m.low, m.high);
   const double change = (m.is_place ? wanted - m.place : wanted) - m.velocity, ahead = m.place + m.velocity;
   const double low =
       std::max(std::max(std::max(-m.acceleration, m.change - m.jerk), m.slowest - m.velocity), m.low - ahead);
@@ -215,10 +227,11 @@ int Limiter::breaks(std::span<const float> rows, int& first) noexcept {
     for (std::size_t i = 0; i < d; ++i) {
       Motion& m = motions_[i];
       const Seen before = row == 0 ? Seen{value(0, i), 0, 0} : m.seen;
-      const double place = value(row, i), velocity = m.is_place ? place - before.place : place;
+      const double place = value(row, i), moved = m.is_place ? place - before.place : place;
+      const double velocity = m.is_gripper ? 0 : moved;
       const double change = velocity - before.velocity, rounding = m.rounding;
       const std::size_t known = m.is_place ? 2 : 1;  // row that has an acceleration: two velocities before it are known
-      is_broken |= m.is_place && (place < m.low - rounding || place > m.high + rounding);
+      is_broken |= (m.is_place || m.is_gripper) && (place < m.low - rounding || place > m.high + rounding);
       is_broken |= velocity < m.slowest - rounding || velocity > m.fastest + rounding;
       is_broken |= row >= known && std::abs(change) > m.acceleration + 2 * rounding;
       is_broken |= row >= known + 1 && std::abs(change - before.change) > m.jerk + 4 * rounding;

@@ -21,7 +21,7 @@ constexpr const char* kFormat = "vla-limits 1";
 constexpr double kFar = 1e9;  // the largest number of a file
 constexpr int kMaxDepth = 8;
 constexpr std::size_t kMaxFile = 1 << 20, kShown = 80;
-constexpr const char* kKinds[] = {"position", "velocity", "difference"};
+constexpr const char* kKinds[] = {"position", "velocity", "difference", "gripper"};
 
 std::string shown(const Json& value) {
   return value.dump(-1, ' ', true, Json::error_handler_t::replace).substr(0, kShown);
@@ -62,12 +62,16 @@ void check(const Column& column) {
   const std::string where = "limits." + column.name;
   for (const auto& [field, most] :
        {std::pair{"velocity", column.velocity}, {"acceleration", column.acceleration}, {"jerk", column.jerk}})
-    if (most && !(0 < *most && *most <= kFar))
+    if (most && column.kind == Kind::gripper)
+      throw usage(where + "." + field, "none of a gripper, which may jump; one that is slowed is a position",
+                  fmt::format("{:g}", *most));
+    else if (most && !(0 < *most && *most <= kFar))
       throw usage(where + "." + field, "a number above 0", fmt::format("{:g}", *most));
   const double low = column.low.value_or(-kFar), high = column.high.value_or(kFar);
   const std::string range = fmt::format("[{:g}, {:g}]", low, high);
   if (!(low < high)) throw usage(where + ".range", "the least below the largest", range);
-  if (column.kind != Kind::position && !(low <= 0 && 0 <= high))
+  const bool is_motion = column.kind == Kind::velocity || column.kind == Kind::difference;
+  if (is_motion && !(low <= 0 && 0 <= high))
     throw usage(where + ".range",
                 fmt::format("zero in the range of a {}: the robot has to be able to stop",
                             kKinds[static_cast<int>(column.kind)]),
@@ -88,7 +92,7 @@ Column column_of(const std::string& name, const Json& given) {
   const auto kind =
       std::find_if(std::begin(kKinds), std::end(kKinds), [&](const char* each) { return given["kind"] == each; });
   if (kind == std::end(kKinds))
-    throw usage(where + ".kind", "one of position, velocity, difference", shown(given["kind"]));
+    throw usage(where + ".kind", "one of position, velocity, difference, gripper", shown(given["kind"]));
   column.kind = static_cast<Kind>(kind - std::begin(kKinds));
   if (given.contains("range")) {
     const Json& range = given["range"];

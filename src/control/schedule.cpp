@@ -182,15 +182,18 @@ bool Schedule::may_act(std::int64_t tick, Action& action) noexcept {
   return true;
 }
 
-/// The weighted sum of the sources' rows for this step.
+/// The weighted sum of the sources' rows for this step; of a gripper the newest one's value, since half of two
+/// decisions is none.
 void Schedule::mix(std::span<float> row) const noexcept {
   for (std::size_t column = 0; column < row.size(); ++column) {
+    const bool is_gripper = options_.limiter != nullptr && options_.limiter->is_gripper(column);
     double sum = 0;
     for (std::size_t i = 0; i < n_source_; ++i) {
       if (!(weights_[i] > 0)) continue;
       const Source& each = source(i);
       const std::size_t at = each.is_held ? 0 : static_cast<std::size_t>(step_ - each.step);
-      sum += weights_[i] * static_cast<double>(each.rows[at * row.size() + column]);
+      const auto value = static_cast<double>(each.rows[at * row.size() + column]);
+      sum = is_gripper ? value : sum + weights_[i] * value;
     }
     row[column] = static_cast<float>(sum);
   }
@@ -264,7 +267,9 @@ Action Schedule::held(std::int64_t tick) noexcept {
     return {.state = ActionState::stopped, .tick = tick, .problem = &stop_};
   }
   if (options_.late != Late::zero && !has_last_) return {.state = ActionState::none, .tick = tick};
-  if (options_.late == Late::zero)
+  if (options_.late == Late::zero && options_.limiter != nullptr)
+    options_.limiter->still(values_);
+  else if (options_.late == Late::zero)
     std::fill(values_.begin(), values_.end(), 0.0f);
   else
     values_ = last_;

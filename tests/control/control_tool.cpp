@@ -169,7 +169,10 @@ Json run_limiter(const Json& scenario) {
 Json run_interpolator(const Json& scenario) {
   std::vector<Kind> kinds;
   for (const Json& kind : scenario["kinds"])
-    kinds.push_back(kind == "position" ? Kind::position : kind == "velocity" ? Kind::velocity : Kind::difference);
+    kinds.push_back(kind == "position"     ? Kind::position
+                    : kind == "velocity"   ? Kind::velocity
+                    : kind == "difference" ? Kind::difference
+                                           : Kind::gripper);
   const std::string method = scenario["method"];
   Interpolator between(kinds,
                        method == "linear"  ? Method::linear

@@ -19,7 +19,7 @@ TOOL = os.environ.get("VLA_CONTROL_TOOL", "")
 pytestmark = pytest.mark.skipif(not TOOL, reason="VLA_CONTROL_TOOL names no control_tool")
 N_SCENARIO = int(os.environ.get("VLA_EXAMPLES", 300))
 PASSING = ("busy", "timeout", "disconnected", "superseded", "late")
-KINDS = ("position", "velocity", "difference")
+KINDS = ("position", "velocity", "difference", "gripper")
 
 
 def in_cpp(scenarios):
@@ -128,10 +128,12 @@ def in_python(scenario):
 def limits_of(rng, names, refuse_above):
     def column():
         entry = {"kind": str(rng.choice(KINDS)), "unit": ""}
-        if rng.random() < 0.5:
+        if entry["kind"] == "gripper" and rng.random() < 0.5:
+            entry["range"] = [float(rng.uniform(0.1, 0.4)), float(rng.uniform(0.5, 1.5))]
+        elif rng.random() < 0.5:
             entry["range"] = [-float(rng.uniform(0.1, 3)), float(rng.uniform(0.1, 3))]
         for field, low, high in (("velocity", 0.1, 20), ("acceleration", 0.5, 100), ("jerk", 5, 2000)):
-            if rng.random() < 0.6:
+            if rng.random() < 0.6 and entry["kind"] != "gripper":
                 entry[field] = float(np.exp(rng.uniform(np.log(low), np.log(high))))
         return entry
 
@@ -218,8 +220,8 @@ def test_both_limiters_give_the_same_bytes():
 def test_both_interpolators_agree(method):
     rng = np.random.default_rng(2)
     scenario = {
-        "kind": "interpolator", "kinds": KINDS, "method": method, "start": rng.uniform(-1, 1, 3).tolist(),
-        "rows": rng.uniform(-1, 1, (20, 3)).astype(np.float32).astype(float).tolist(), "shares": [0.1, 0.35, 0.5, 0.99, 1.0],
+        "kind": "interpolator", "kinds": KINDS, "method": method, "start": rng.uniform(-1, 1, 4).tolist(),
+        "rows": rng.uniform(-1, 1, (20, 4)).astype(np.float32).astype(float).tolist(), "shares": [0.1, 0.35, 0.5, 0.99, 1.0],
     }  # fmt: skip
     between = Interpolator(KINDS, method=method, rate_hz=20)
     between.start_at(scenario["start"])
@@ -234,7 +236,7 @@ def test_both_interpolators_agree(method):
 def texts():
     """Files of limits, right and wrong: each field of a good one changed."""
     yield json.dumps(GOOD)
-    values = (None, 0, 1, -1, 1e300, 0.5, True, "", "position", "velocity", [], [0, 1], [1, 0], [None, None], [0.5, 1], {}, "radians")
+    values = (None, 0, 1, -1, 1e300, 0.5, True, "", "position", "velocity", "gripper", [], [0, 1], [1, 0], [None, None], [0.5, 1], {}, "radians")
     for value in values:
         for field in GOOD:
             yield json.dumps({**GOOD, field: value})

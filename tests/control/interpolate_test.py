@@ -56,6 +56,11 @@ def test_at_any_rate_a_steady_motion_stays_steady():
         assert np.diff(out[20:]) == pytest.approx(0.01, abs=1e-3)
 
 
+def test_a_gripper_is_commanded_at_once():
+    for method in METHODS:
+        assert filled(method, [0, 1, 1, -1], 4, "gripper").tolist() == [1] * 8 + [-1] * 4
+
+
 def test_the_end_of_a_motion_is_the_textbooks_minimum_jerk():
     s = np.arange(1, 11) / 10
     between = Interpolator(["position"], method="minimum_jerk", rate_hz=20)

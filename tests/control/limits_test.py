@@ -13,7 +13,9 @@ from simulation import N_EXAMPLE
 
 from vla_cpp import BadAction, UsageError
 from vla_cpp.control import ChunkSchedule, Column, CrossFade, Limiter, Limits
+from vla_cpp.control.blend import Ensemble
 from vla_cpp.control.limits import KINDS
+from vla_cpp.control.schedule import late_rule
 from vla_cpp.spec import BundleInfo, Spec
 
 many = settings(max_examples=N_EXAMPLE, deadline=None)
@@ -28,7 +30,9 @@ def maybe(low, high):
 def columns(draw, name):
     ranged = draw(st.booleans())
     low, high = (-draw(st.floats(0.05, 3)), draw(st.floats(0.05, 3))) if ranged else (None, None)
-    return Column(name, draw(st.sampled_from(KINDS)), "", low, high, draw(maybe(0.1, 10)), draw(maybe(0.3, 60)), draw(maybe(2, 1000)))
+    kind = draw(st.sampled_from(KINDS))
+    most = () if kind == "gripper" else (draw(maybe(0.1, 10)), draw(maybe(0.3, 60)), draw(maybe(2, 1000)))
+    return Column(name, kind, "", low, high, *most)
 
 
 @st.composite
@@ -57,7 +61,10 @@ def driven(limits, rate_hz, wanted):
 def excess(column, rate_hz, commands):
     """The largest excess of any limit of a column, as a share of it; commands begin after rest at zero. Written from the definitions."""
     values = np.concatenate([np.zeros(3), commands.astype(np.float64)])
-    velocity = {"position": lambda: np.diff(values) * rate_hz, "difference": lambda: values[1:] * rate_hz, "velocity": lambda: values[1:]}[column.kind]()
+    if column.kind == "position":
+        velocity = np.diff(values) * rate_hz
+    else:  # of a gripper only the range is limited
+        velocity = values[1:] * (rate_hz if column.kind == "difference" else 1)
     acceleration = np.diff(velocity) * rate_hz
     jerk = np.diff(acceleration) * rate_hz
     rounding = 2.0**-23 * np.abs(values).max()
@@ -120,6 +127,18 @@ def test_a_motion_towards_a_stop_brakes_before_it():
     assert speed.max() == pytest.approx(2, abs=0.25) and np.abs(np.diff(speed) * 20).max() < 4.001
 
 
+def test_a_gripper_may_jump_within_its_range():
+    limits = Limits((Column("grip", "gripper", "", 0.2, 0.8),), 0.5)
+    limiter = Limiter(limits, 10)
+    limiter.rest_at([0.0])  # outside of what may be commanded: a gripper that is forced open
+    wanted = [0.2, 0.8, 0.25, 1.0, -1.0]
+    found = [limiter.step([value]) for value in wanted]
+    assert [float(out[0]) for out, _ in found] == pytest.approx([0.2, 0.8, 0.25, 0.8, 0.2])
+    assert [bool(cut[0]) for _, cut in found] == [False, False, False, True, True]
+    assert limiter.still() == pytest.approx([0.2])
+    assert limiter.breaks(np.array([[0.2], [0.8], [0.9]])).tolist() == [False, False, True]
+
+
 def test_a_limiter_wants_to_know_where_the_robot_is():
     limits = Limits((Column("x", "position", "", -1, 1),), 1.0)
     limiter = Limiter(limits, 20)
@@ -172,6 +191,32 @@ def test_an_action_says_which_columns_were_cut():
     assert schedule.counts["limited"] == 2
 
 
+@pytest.mark.parametrize("blend", (CrossFade(3), Ensemble(0.1)))
+def test_a_gripper_takes_the_newest_chunks_value(blend):
+    limiter = Limiter(Limits((Column("x", "position"), Column("grip", "gripper")), 1.0), 10)
+    schedule = ChunkSchedule(horizon=8, d_action=2, replan_every=1, blend=blend, on_late=None, limiter=limiter)
+    limiter.rest_at([0, -1])
+    found = []
+    for tick, value in enumerate((-1.0, 1.0, 1.0)):
+        schedule.observe(tick)
+        schedule.receive(np.full((8, 2), value), tick)
+        found.append(schedule.next(tick).values)
+    assert [row[1] for row in found] == [-1, 1, 1]
+    assert -1 < found[1][0] < found[2][0] < 1
+
+
+def test_a_robot_that_stands_still_keeps_what_its_gripper_holds():
+    limiter = Limiter(Limits((Column("dx", "difference"), Column("grip", "gripper")), 1.0), 10)
+    schedule = ChunkSchedule(horizon=1, d_action=2, replan_every=1, blend=CrossFade(0), on_late=late_rule("zero", 2, limiter), limiter=limiter)
+    limiter.rest_at([0, 0.3])
+    assert schedule.next(0).values.tolist() == [0, np.float32(0.3)]
+    schedule.observe(1)
+    schedule.receive(np.array([[0.5, 1.0]]), 1)
+    assert schedule.next(1).values.tolist() == [0.5, 1]
+    late = schedule.next(2)
+    assert late.held and late.values.tolist() == [0, 1]
+
+
 def test_limits_and_the_largest_jump_exclude_each_other():
     with pytest.raises(UsageError, match="max_jump"):
         limiter = Limiter(Limits((Column("x", "position"),), 1.0), 10)
@@ -220,6 +265,7 @@ def test_a_file_is_read_written_and_put_into_the_policys_order(tmp_path):
         (changed(pan={"kind": "position", "unit": "", "range": [1, -1]}), "the least below the largest"),
         (changed(pan={"kind": "position", "unit": "", "range": [1]}), r"\[least, largest\]"),
         (changed(pan={"kind": "velocity", "unit": "", "range": [0.5, 1]}), "zero in the range"),
+        (changed(pan={"kind": "gripper", "unit": "", "velocity": 1}), "none of a gripper, which may jump; one that is slowed is a position"),
         (changed(pan={"kind": "position", "unit": "", "velocity": 0}), "above 0"),
         (changed(pan={"kind": "position", "unit": "", "jerk": -1}), "above 0"),
         (changed(pan={"kind": "position", "unit": "", "velocity": 1e300}), "a number up to"),
@@ -264,3 +310,12 @@ def test_suggested_limits_hold_what_the_robot_did():
     assert Limiter(tight, 20).breaks(rows).mean() > 0.5
     with pytest.raises(UsageError, match="without grip"):
         Limits.suggest(SPEC, {"pan": "position"}, rows, 20, margin=1, refuse_above=0)
+
+
+def test_of_a_gripper_the_ends_alone_are_suggested():
+    rows = np.stack([np.sin(np.arange(40) / 20), np.repeat([0.0, 1.0], 20)], 1)
+    kinds = {"pan": "position", "grip": "gripper"}
+    grip = Limits.suggest(SPEC, kinds, rows, 20, margin=1.5, refuse_above=0).columns[1]
+    assert grip == Column("grip", "gripper", "", 0, 1)
+    still = Limits.suggest(SPEC, kinds, rows[:20], 20, margin=1.5, refuse_above=0).columns[1]
+    assert still == Column("grip", "gripper")

@@ -9,7 +9,7 @@ import pytest
 from loop_test import SPEC
 
 from vla_cpp import BundleInfo
-from vla_cpp.control import Action, EpisodeWriter, Limiter, Limits, suggest
+from vla_cpp.control import Action, Column, EpisodeWriter, Limiter, Limits, suggest
 from vla_cpp.control.suggest import N_STD, main
 
 SHIPPED = "models/metaworld-tiny.gguf"
@@ -114,6 +114,34 @@ def test_episodes_give_the_largest_of_what_was_commanded(spec, tmp_path):
     for values in rows:
         limiter = Limiter(limits, 20)
         assert not limiter.breaks(values[:20]).any() and not limiter.breaks(values[20:]).any()
+
+
+def test_a_gripper_gets_no_velocity_from_episodes(spec, tmp_path, capsys):
+    told = spec(("x", "grip"))
+    with EpisodeWriter(tmp_path / "episodes", told, 20) as episodes:
+        episodes.begin("go")
+        for i in range(60):
+            episodes.add({"images": {}, "state": {}}, Action(np.array([np.sin(i / 10), -1 if i % 30 < 15 else 1], np.float32), i, False))
+        episodes.end(None)
+    arguments = ["--margin", "1.5", "--episodes", tmp_path / "episodes"]
+    assert run(tmp_path, "--kind", "position", *arguments)[0] == 2
+    assert "-1, 1 alone in 60 commands; --kind grip=gripper for one that opens and closes" in capsys.readouterr().err
+    code, limits = run(tmp_path, "--kind", "position", "--kind", "grip=gripper", *arguments)
+    assert code == 0 and limits.columns[1] == Column("grip", "gripper", "", -1, 1)
+
+
+def test_a_gripper_needs_no_joint_of_a_urdf(spec, tmp_path):
+    spec(("pan", "grip"), ("radians", "m"))
+    kinds = ["--kind", "position", "--kind", "grip=gripper"]
+    assert run(tmp_path, *kinds, *urdf(tmp_path))[1].columns[1] == Column("grip", "gripper", "m")
+    _, limits = run(tmp_path, *kinds, "--joint", "grip=slide", *urdf(tmp_path))
+    assert limits.columns[1] == Column("grip", "gripper", "m", 0, 0.04)
+
+
+def test_statistics_of_a_gripper_are_its_ends(spec, tmp_path):
+    spec(("x", "grip"), (), {"stats.action.min": [-2.0, 0.0], "stats.action.max": [4.0, 1.0]})
+    _, limits = run(tmp_path, "--kind", "position", "--kind", "grip=gripper", "--statistics", "--margin", "2")
+    assert limits.columns[1] == Column("grip", "gripper", "", 0, 1)
 
 
 @pytest.mark.parametrize(

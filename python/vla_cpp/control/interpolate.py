@@ -11,7 +11,7 @@ A command of a control period is reached at the end of that period, so what is i
                   ends it has the least squared jerk (Flash and Hogan 1985)
 
 so a new chunk, or a late one, makes no jump either. A polynomial may pass its ends by a little where a motion turns; a Limiter at the
-controller's rate keeps that within limits. A velocity is held for its period. A difference is spread over it: its parts sum to it.
+controller's rate keeps that within limits. A velocity and a gripper are held for their period. A difference is spread over it: its parts sum to it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Interpolator:
             for s in (0.1, 0.2, ..., 1.0):      # 200 times a second
                 command(between.at(s))
 
-    kinds    "position", "velocity" or "difference" of each column
+    kinds    "position", "velocity", "difference" or "gripper" of each column
     method   how positions are interpolated: "linear", "cubic" or "minimum_jerk"
     rate_hz  control periods a second
     """
@@ -65,7 +65,8 @@ class Interpolator:
             raise UsageError("rate_hz", "periods per second, above 0", str(rate_hz))
         self.delay_s = 1 / rate_hz
         self._powers = METHODS[method]
-        self._is_place, self._is_velocity = (np.array([kind == each for kind in kinds]) for each in ("position", "velocity"))
+        self._is_place = np.array([kind == "position" for kind in kinds])
+        self._is_held = np.array([kind in ("velocity", "gripper") for kind in kinds])
         self._command = np.full(len(kinds), np.nan)
         self._coefficients = np.zeros((len(self._powers), len(kinds)))
         self._s = 1.0
@@ -98,7 +99,7 @@ class Interpolator:
         if not self._s < s <= 1:
             raise UsageError("s", f"a share of the period above {self._s:g}, 1 at most", str(s))
         place, _, _ = self._motion(s)
-        rest = np.where(self._is_velocity, self._command, (s - self._s) * self._command)
+        rest = np.where(self._is_held, self._command, (s - self._s) * self._command)
         self._s = s
         return np.where(self._is_place, place, rest).astype(np.float32)
 

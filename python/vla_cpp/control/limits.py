@@ -32,7 +32,7 @@ from ..spec import Spec
 from ..strict_json import no_constant, unique_names
 
 FORMAT = "vla-limits 1"
-KINDS = ("position", "velocity", "difference")
+KINDS = ("position", "velocity", "difference", "gripper")
 N_HALF = 16  # halvings, at most, of the search for a permitted command
 MAX_STOP = 4096  # steps of the longest stop that is looked for
 MAX_FILE = 1 << 20  # bytes
@@ -45,7 +45,8 @@ ROUNDING = 1e-12  # of a product in double, and far below the slack
 class Column:
     """The limits of an action column, in its unit and seconds. None: not limited.
 
-    kind          "position": the value is a place. "velocity": units per second. "difference": units per control period
+    kind          "position": the value is a place. "velocity": units per second. "difference": units per control period.
+                  "gripper": an opening or a decision, which may jump and is never mixed with another: it has a range alone
     unit          as the bundle says it; empty where it does not
     low, high     of the value itself
     velocity      largest change of place a second: of a position between commands, of the others the value itself
@@ -113,9 +114,9 @@ class Limits:
     ) -> Limits:
         """First limits from what a robot really was commanded: the largest of each, times `margin`.
 
-        kinds     "position", "velocity" or "difference" of each action
+        kinds     "position", "velocity", "difference" or "gripper" of each action
         commands  (n, d_action), n of at least four, one after the other at `rate_hz`
-        margin    1 or more; a range grows by its share of the range
+        margin    1 or more; a range grows by its share of the range. That of a gripper stays: it is open or closed at its ends
         """
         rows = np.asarray(commands, np.float64)
         if rows.ndim != 2 or rows.shape[1] != spec.d_action or len(rows) < 4 or not np.isfinite(rows).all():
@@ -131,7 +132,10 @@ class Limits:
             place = rows[:, i] if kinds[name] == "position" else np.cumsum(rows[:, i])
             most = [margin * float(np.abs(np.diff(place, n)).max()) / s or None for n, s in zip((1, 2, 3), scale)]
             unit = spec.action_units[i] if spec.action_units else ""
-            columns.append(Column(name, kinds[name], unit, float(low - grown), float(high + grown), *most))
+            if kinds[name] == "gripper":
+                columns.append(gripper(name, unit, float(low), float(high)))
+            else:
+                columns.append(Column(name, kinds[name], unit, float(low - grown), float(high + grown), *most))
         return Limits(tuple(columns), refuse_above)
 
     def of(self, spec: Spec) -> Limits:
@@ -162,7 +166,10 @@ class Limiter:
         self.limits = limits
         columns = limits.columns
         self._is_place = np.array([c.kind == "position" for c in columns])
+        self.is_gripper = np.array([c.kind == "gripper" for c in columns])
         low, high = (np.array([_or(getattr(c, f), s * FAR) for c in columns]) for f, s in (("low", -1), ("high", 1)))
+        self._closed, self._open = np.where(low > -FAR, low, -np.inf), np.where(high < FAR, high, np.inf)
+        low, high = np.where(self.is_gripper, -FAR, low), np.where(self.is_gripper, FAR, high)
         scale = np.array([_scale(c.kind, rate_hz) for c in columns]).T
         most = [np.array([_or(getattr(c, f), math.inf) for c in columns]) * s for f, s in zip(("velocity", "acceleration", "jerk"), scale)]
         # Where a limit is missing, one that the others imply: none of these is ever reached.
@@ -177,7 +184,7 @@ class Limiter:
     def reset(self) -> None:
         """Forgets the commands: where a position is has to be said again by `rest_at`."""
         n = len(self._is_place)
-        self._place = np.where(self._is_place, np.nan, 0.0)
+        self._place = np.where(self._is_place | self.is_gripper, np.nan, 0.0)
         self._velocity, self._change = np.zeros(n), np.zeros(n)
         self._stop = np.zeros((0, n))
 
@@ -193,7 +200,11 @@ class Limiter:
             column = self.limits.columns[i]
             raise UsageError(f"limits.{column.name}", f"{column.low} to {column.high}", f"{values[i]:g}, where the robot is")
         self.reset()
-        self._place = np.where(self._is_place, values, 0.0)
+        self._place = np.where(self._is_place | self.is_gripper, values, 0.0)
+
+    def still(self) -> np.ndarray:
+        """What stands still where no column is a position: zeros, and of a gripper its last command. float32."""
+        return np.where(self.is_gripper, self._place, 0.0).astype(np.float32)
 
     def step(self, values: Any) -> Tuple[np.ndarray, np.ndarray]:
         """The command for wanted values, float32, and which of its columns differ from them.
@@ -203,7 +214,7 @@ class Limiter:
         wanted = finite_row("command", values, len(self._is_place))
         if np.isnan(self._place).any():
             raise UsageError("limits", "where the robot is: rest_at, or start_at of the loop", "nothing")
-        change = np.where(self._is_place, wanted - self._place, wanted) - self._velocity
+        change = np.where(self._is_place, wanted - self._place, np.where(self.is_gripper, 0.0, wanted)) - self._velocity
         low, high = self._span()
         kept = self._stop[0] if len(self._stop) else np.zeros_like(change)
         inside = (change >= low - SLACK * (1 + np.abs(low))) & (change <= high + SLACK * (1 + np.abs(high)))
@@ -211,9 +222,10 @@ class Limiter:
         self._change = best
         self._velocity = self._velocity + best
         out = np.where(self._is_place, self._place + self._velocity, self._velocity)
+        out = np.where(self.is_gripper, np.clip(wanted, self._closed, self._open), out)
         is_cut = out.astype(np.float32) != wanted.astype(np.float32)
         out = np.where(is_cut, out + 0.0, wanted)
-        self._place = np.where(self._is_place, out, 0.0)
+        self._place = np.where(self._is_place | self.is_gripper, out, 0.0)
         self._stop = stops
         return out.astype(np.float32), is_cut
 
@@ -221,8 +233,9 @@ class Limiter:
         """Which rows of a chunk break a limit by themselves or together with the rows before them: bool, one a row."""
         rows = np.asarray(rows, np.float64)
         slack = 8 * np.finfo(np.float32).eps * np.abs(rows).max(0, initial=0)  # rows are float32, and differences of them
-        velocity = np.where(self._is_place, np.diff(rows, axis=0, prepend=rows[:1]), rows)
+        velocity = np.where(self._is_place, np.diff(rows, axis=0, prepend=rows[:1]), np.where(self.is_gripper, 0.0, rows))
         broken = self._is_place & ((rows < self._low - slack) | (rows > self._high + slack))
+        broken |= self.is_gripper & ((rows < self._closed - slack) | (rows > self._open + slack))
         broken |= (velocity < self._slowest - slack) | (velocity > self._fastest + slack)
         index = np.arange(len(rows))[:, None]
         first = np.where(self._is_place, 2, 1)  # row that has an acceleration: two velocities before it are known
@@ -335,6 +348,11 @@ class Limiter:
         return np.where(after, 0.0, low), np.where(after, 0.0, high)
 
 
+def gripper(name: str, unit: str, low: float, high: float) -> Column:
+    """The limits of a gripper that was commanded between these values; none where they are one."""
+    return Column(name, "gripper", unit, low, high) if low < high else Column(name, "gripper", unit)
+
+
 def finite_row(where: str, values: Any, n: int) -> np.ndarray:
     """One number for each of n columns, in double. Errors: BadAction."""
     row = np.array(values, np.float64)
@@ -391,12 +409,14 @@ def _check(column: Column) -> None:
         raise UsageError(f"{where}.kind", f'one of {", ".join(KINDS)}', str(column.kind))
     for field in ("velocity", "acceleration", "jerk"):
         value = getattr(column, field)
+        if value is not None and column.kind == "gripper":
+            raise UsageError(f"{where}.{field}", "none of a gripper, which may jump; one that is slowed is a position", str(value))
         if value is not None and not 0 < value <= FAR:
             raise UsageError(f"{where}.{field}", "a number above 0", str(value))
     low, high = _or(column.low, -FAR), _or(column.high, FAR)
     if not low < high:
         raise UsageError(f"{where}.range", "the least below the largest", f"[{column.low}, {column.high}]")
-    if column.kind != "position" and not low <= 0 <= high:
+    if column.kind in ("velocity", "difference") and not low <= 0 <= high:
         raise UsageError(f"{where}.range", f"zero in the range of a {column.kind}: the robot has to be able to stop", f"[{column.low}, {column.high}]")
 
 

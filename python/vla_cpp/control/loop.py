@@ -127,7 +127,7 @@ class ChunkLoop:
             d_action=spec.d_action,
             replan_every=replan_every,
             blend=_blend_of(blend, fade_steps, decay),
-            on_late=late_rule(on_late, spec.d_action),
+            on_late=late_rule(on_late, spec.d_action, self._limiter),
             max_age=_age_in_ticks(max_age, rate_hz, None if mode == "sync" else spec.horizon),
             max_jump=max_jump,
             limiter=self._limiter,

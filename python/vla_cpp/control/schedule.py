@@ -187,7 +187,7 @@ class ChunkSchedule:
             return self._hold(tick)
         weights = self._blend.weights(self._sources, self.step) if self._sources else ()
         parts = [(w, s) for w, s in zip(weights, self._sources) if w > 0]
-        wanted = sum(w * s.row(self.step).astype(np.float64) for w, s in parts).astype(np.float32) if parts else None
+        wanted = self._mix(parts) if parts else None
         is_human = human is not None
         values, limited, clamped = self._limit(human if is_human else wanted, is_human)
         self._last = values
@@ -212,6 +212,11 @@ class ChunkSchedule:
         self._sources, self._flight = [], None
 
     # --- inside ----------------------------------------------------------------------------------------------------------------
+
+    def _mix(self, parts: List[Tuple[float, Source]]) -> np.ndarray:
+        """The weighted sum of the sources' rows for this step; of a gripper the newest one's value, since half of two decisions is none."""
+        row = sum(w * s.row(self.step).astype(np.float64) for w, s in parts).astype(np.float32)
+        return np.where(self._limiter.is_gripper, parts[-1][1].row(self.step), row) if self._limiter else row
 
     def _begin(self, tick: int) -> None:
         if tick <= self._tick:
@@ -281,12 +286,14 @@ class ChunkSchedule:
             raise BadAction("chunk", f"at most a share of {most:g} of its rows outside of the limits", found, hint)
 
 
-def late_rule(on_late: Union[str, OnLate], d_action: int) -> OnLate:
-    """`on_late` of ChunkLoop as a function."""
+def late_rule(on_late: Union[str, OnLate], d_action: int, limiter: Optional[Limiter] = None) -> OnLate:
+    """`on_late` of ChunkLoop as a function. "zero" leaves grippers, of which limits tell, as they are."""
     if callable(on_late):
         return on_late
     if on_late == "hold":
         return lambda last, tick: last
+    if on_late == "zero" and limiter:
+        return lambda last, tick: limiter.still()
     if on_late == "zero":
         return lambda last, tick: np.zeros(d_action, np.float32)
     if on_late == "stop":

@@ -19,16 +19,17 @@ from ..errors import IoError, UsageError, VlaError
 from ..program import candidates
 from ..spec import BundleInfo, Spec
 from .episodes import Episode, episodes_of
-from .limits import KINDS, Column, Limits
+from .limits import KINDS, Column, Limits, gripper
 
 EPILOG = """examples:
   vla-limits suggest policy.gguf --kind position --urdf arm.urdf --refuse-above 0.3 -o limits.json
-  vla-limits suggest policy.gguf --kind position --kind gripper=velocity --episodes episodes --margin 1.2 --refuse-above 0.3 -o limits.json
+  vla-limits suggest policy.gguf --kind position --kind gripper=gripper --episodes episodes --margin 1.2 --refuse-above 0.3 -o limits.json
   vla-limits suggest policy.gguf --kind difference --statistics --margin 1.5 --refuse-above 0.3 -o limits.json
   vla-limits check limits.json policy.gguf
 A first file is a place to start from: read it, and tighten it. Exit codes: 0 done, 2 usage or limits of another robot, 9 a file."""
 CODES = {"usage": 2, "io": 9, "bad_request": 9}
 MAX_URDF = 16 << 20  # bytes
+FEW_VALUES, MANY_COMMANDS = 3, 20  # a column with so few values in so many commands is no joint
 N_STD = 4.0  # of the actions around their mean, where a bundle has no better statistics
 RADIANS, DEGREES, METRES = ("rad", "radian", "radians"), ("deg", "degree", "degrees"), ("m", "metre", "metres", "meter", "meters")
 
@@ -94,6 +95,9 @@ def of_urdf(path: Path, spec: Spec, kinds: Mapping[str, str], given: Sequence[st
         raise UsageError("--joint", f"actions of {spec.bundle.name}: {', '.join(spec.action_names)}", ", ".join(extra))
     columns = []
     for i, name in enumerate(spec.action_names):
+        if kinds[name] == "gripper" and name not in renamed:  # its opening is rarely in the joint's unit
+            columns.append(Column(name, "gripper", spec.action_units[i] if spec.action_units else ""))
+            continue
         joint = renamed.get(name, name[: -len(".pos")] if name.endswith(".pos") else name)
         if joint not in joints:
             hint = f"--joint {name}=JOINT for a joint of another name"
@@ -133,11 +137,11 @@ def _column(path: Path, name: str, kind: str, unit: str, joint: Tuple[str, Dict[
     if low_unit and low_unit not in known:
         raise UsageError(str(path), f"a joint in {unit}, as the bundle says {name} is", f"{type_}, in {'radians' if is_turning else 'metres'}")
     scale = 180 / math.pi if low_unit in DEGREES else 1.0
-    is_ranged = kind == "position" and type_ != "continuous"
-    if (is_ranged and not {"lower", "upper"} <= set(limit)) or not limit.get("velocity", 0) > 0:
+    is_ranged, has_velocity = kind in ("position", "gripper") and type_ != "continuous", kind != "gripper"
+    if (is_ranged and not {"lower", "upper"} <= set(limit)) or (has_velocity and not limit.get("velocity", 0) > 0):
         raise UsageError(f"{path}: joint of {name}", "a limit with lower, upper and velocity", str(limit) if limit else "none")
     low, high = (scale * limit["lower"], scale * limit["upper"]) if is_ranged else (None, None)
-    return Column(name, kind, unit, low, high, velocity=scale * limit["velocity"])
+    return Column(name, kind, unit, low, high, velocity=scale * limit["velocity"] if has_velocity else None)
 
 
 def of_statistics(stats: Mapping[str, Sequence[float]], spec: Spec, kinds: Mapping[str, str], margin: float) -> Tuple[List[Column], str]:
@@ -154,6 +158,9 @@ def of_statistics(stats: Mapping[str, Sequence[float]], spec: Spec, kinds: Mappi
         ends, told = (mean - N_STD * std, mean + N_STD * std), f"mean and {N_STD:g} deviations"
     columns = []
     for i, name in enumerate(spec.action_names):
+        if kinds[name] == "gripper":
+            columns.append(gripper(name, spec.action_units[i] if spec.action_units else "", float(ends[0][i]), float(ends[1][i])))
+            continue
         grown = (margin - 1) / 2 * (ends[1][i] - ends[0][i])
         low, high = float(ends[0][i] - grown), float(ends[1][i] + grown)
         if kinds[name] != "position":
@@ -186,14 +193,26 @@ def suggest(a: argparse.Namespace) -> None:
 def of_episodes(folder: Path, spec: Spec, kinds: Mapping[str, str], margin: float, refuse_above: float) -> Limits:
     """The largest of what each episode commanded. Errors: UsageError for episodes of other actions."""
     found: List[Limits] = []
+    commands: List[np.ndarray] = []
     for episode in episodes_of(folder):
         if episode.header.action_names != spec.action_names:
             raise UsageError(str(episode.folder), f"the actions of {spec.bundle.name}: {', '.join(spec.action_names)}", ", ".join(episode.header.action_names))
         for rows in _runs(episode):
+            commands.append(rows)
             found.append(Limits.suggest(spec, kinds, rows, episode.header.rate_hz, margin=margin, refuse_above=refuse_above))
     if not found:
         raise UsageError(str(folder), "an episode of four commands or more", "none")
+    _check_joints(folder, spec, kinds, np.concatenate(commands))
     return Limits(tuple(_widest([each.columns[i] for each in found]) for i in range(spec.d_action)), refuse_above)
+
+
+def _check_joints(folder: Path, spec: Spec, kinds: Mapping[str, str], commands: np.ndarray) -> None:
+    """Errors: UsageError for a position that jumps between a few values, whose velocity would permit any motion."""
+    for i, name in enumerate(spec.action_names):
+        values = np.unique(commands[:, i])
+        if kinds[name] == "position" and 2 <= len(values) <= FEW_VALUES and len(commands) >= MANY_COMMANDS:
+            found = f"{', '.join(f'{value:g}' for value in values)} alone in {len(commands)} commands"
+            raise UsageError(f"{folder}: {name}", "a joint that moves", found, f"--kind {name}=gripper for one that opens and closes")
 
 
 def _runs(episode: Episode) -> List[np.ndarray]:
@@ -212,7 +231,7 @@ def _widest(columns: Sequence[Column]) -> Column:
         return max((getattr(c, field) for c in columns if getattr(c, field) is not None), default=None)
 
     first = columns[0]
-    low = min(c.low for c in columns if c.low is not None)
+    low = min((c.low for c in columns if c.low is not None), default=None)
     return Column(first.name, first.kind, first.unit, low, most("high"), most("velocity"), most("acceleration"), most("jerk"))
 
 
