@@ -67,6 +67,9 @@ inline CLI::Option* add_absent(CLI::App& command, std::vector<std::string>& view
       ->allow_extra_args(false);
 }
 
+/// Limits of what a chunk may be, wherever chunks are answered.
+CLI::Option* add_limits(CLI::App& command, std::string& file, std::string& on_limit);
+
 /// Replaces a name `hub:OWNER/NAME@REVISION` by the file that vla-pull has put there; other text names a file. What
 /// comes back is the problem, or empty.
 std::string find_pulled(std::string& bundle);

@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <iterator>
+#include <limits>
 #include <random>
 
 #include "cli/commands.h"
@@ -26,8 +27,8 @@ Level level_of(const ObservabilityOptions& options) {
   return static_cast<Level>(found - std::begin(observe::kLevelNames));
 }
 
-/// Adds the ranges of a robot's states in training: extremes or, where the bundle has none, three deviations around
-/// the mean. Keys are `tag/state`.
+}  // namespace
+
 void add_ranges(const Robot& robot, std::map<std::string, observe::Page::Range>& ranges) {
   for (const std::string& state : robot.processor().states().names()) {
     const auto stats = [&](const char* name) { return robot.bundle().stats(fmt::format("stats.{}.{}", state, name)); };
@@ -43,8 +44,6 @@ void add_ranges(const Robot& robot, std::map<std::string, observe::Page::Range>&
   }
 }
 
-}  // namespace
-
 std::string drawn_token() {
   std::random_device device;
   std::string token;
@@ -52,11 +51,15 @@ std::string drawn_token() {
   return token;
 }
 
-void describe_for_page(observe::Page& page, const v1::Description& description, const Engine& engine) {
-  std::map<std::string, observe::Page::Range> ranges;
+void describe_for_page(observe::Page& page, const v1::Description& description, const Engine& engine,
+                       const std::optional<control::Limits>& limits) {
+  std::map<std::string, observe::Page::Range> ranges, actions;
+  constexpr double kNone = std::numeric_limits<double>::infinity();
+  for (const control::Column& column : limits ? limits->columns : std::vector<control::Column>())
+    actions[column.name] = {{column.low.value_or(-kNone)}, {column.high.value_or(kNone)}};
   for (const Robot* robot : engine.robots()) add_ranges(*robot, ranges);
   const auto max_pixels = static_cast<std::int64_t>(description.limits().max_pixels());
-  page.describe(description, ranges, [&engine, max_pixels](const v1::Act& act, int view) {
+  page.describe(description, ranges, actions, [&engine, max_pixels](const v1::Act& act, int view) {
     return serve::seen(act, view, engine, max_pixels);
   });
 }
@@ -148,7 +151,7 @@ void Observability::loaded(const std::string& name, const Engine& engine) {
   const v1::Description description = server_.describe(name, engine);
   if (metrics_) metrics_->describe(description, engine.memory());
   if (recordings_) recordings_->describe(description);
-  if (page_) describe_for_page(*page_, description, engine);
+  if (page_) describe_for_page(*page_, description, engine, server_.limits());
   const v1::Bundle& bundle = description.bundle();
   if (phase_ != nullptr) phase_ = "warming up";
   log_.event(Level::info, "loaded",

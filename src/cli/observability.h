@@ -4,6 +4,7 @@
 
 #include <CLI/CLI.hpp>
 #include <atomic>
+#include <map>
 #include <memory>
 #include <string>
 #include <vector>
@@ -28,9 +29,14 @@ struct ObservabilityOptions {
 /// What a page asks of who wants to see it: 128 bits of the system's, as hexadecimal digits.
 std::string drawn_token();
 
-/// How a policy that is loaded is shown: where its states were in training, and how it sees. The engine outlives the
-/// page.
-void describe_for_page(observe::Page& page, const v1::Description& description, const Engine& engine);
+/// Adds the ranges of a robot's states in training: extremes or, where the bundle has none, three deviations around
+/// the mean. Keys are `tag/state`.
+void add_ranges(const Robot& robot, std::map<std::string, observe::Page::Range>& ranges);
+
+/// How a policy that is loaded is shown: where its states were in training, where its actions may be, and how it sees.
+/// The engine outlives the page.
+void describe_for_page(observe::Page& page, const v1::Description& description, const Engine& engine,
+                       const std::optional<control::Limits>& limits);
 
 void add_observability_options(CLI::App& command, ObservabilityOptions& options);
 

@@ -22,7 +22,7 @@ namespace vla::cli {
 namespace {
 
 struct ReplayOptions {
-  std::string folder, bundle, kernels, device, embodiment, connect, page;
+  std::string folder, bundle, kernels, device, embodiment, connect, page, limits, on_limit;
   double speed = 1;
   int n_thread = 0;
   std::vector<std::string> absent;
@@ -74,7 +74,8 @@ Result<serve::ServerOptions> limits_of(const v1::Limits& limits) {
 
 /// Serves the bundle in this process, as `vla serve` would, for the time of the replay.
 Result<observe::ReplayReport> replay_bundle(observe::Recording& recording, ReplayOptions& options) {
-  VLA_TRY(const serve::ServerOptions limits, limits_of(recording.description().limits()));
+  VLA_TRY(serve::ServerOptions limits, limits_of(recording.description().limits()));
+  limits.limits = options.limits, limits.on_limit = options.on_limit;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(limits));
   VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
                                                                         .kernels = options.kernels,
@@ -118,15 +119,16 @@ Status show(observe::Recording& recording, const ReplayOptions& options) {
   const auto health = [&n_shown] { return observe::Health{.ready = true, .n_chunk = n_shown}; };
   const v1::Description& description = recording.description();
   std::unique_ptr<Engine> engine;
+  VLA_TRY(const auto action_limits, serve::read_limits({.limits = options.limits, .on_limit = options.on_limit}));
   VLA_TRY(const std::unique_ptr<observe::Page> page,
           observe::Page::open(
               options.page, false,
               {.token = drawn_token(), .is_same = serve::is_same_secret, .health = health, .is_server = false}));
-  page->describe(description, {}, {});
+  page->describe(description, {}, {}, {});
   if (!options.bundle.empty()) {
     VLA_CHECK(limits_of(description.limits()));
     VLA_TRY(engine, open_recorded(description, options));
-    describe_for_page(*page, description, *engine);
+    describe_for_page(*page, description, *engine, action_limits);
   }
   say(stdout, "page={}\n", page->url());
   std::fflush(stdout);
@@ -176,6 +178,7 @@ Command add_replay(CLI::App& app) {
   add_text(*command, "--device", options->device, "NAME", std::string(kDeviceHelp) + "; with --bundle")->needs(bundle);
   add_text(*command, "--embodiment", options->embodiment, "TAG", "As for vla serve; with --bundle")->needs(bundle);
   add_absent(*command, options->absent)->needs(bundle);
+  add_limits(*command, options->limits, options->on_limit)->needs(bundle);
   command
       ->add_option("--threads", options->n_thread,
                    "CPU threads, with --bundle; 0 takes every core, of big and little ones the big")

@@ -287,6 +287,15 @@ Status serve(ServeOptions& options, bool& ready) {
   return status;
 }
 
+/// What a server may do with rows outside of the limits; the problem, or empty.
+std::string check_on_limit(const std::string& given) {
+  if (given == "note" || given == "refuse") return {};
+  return given == "clamp"
+             ? "expected note or refuse, found clamp: a server does not know where the robot is when a row "
+               "is commanded; the limits of its control loop clamp (docs/control.md)"
+             : "expected note or refuse, found " + given;
+}
+
 /// Adds the options that let clients of other servers in as they are.
 void add_other_protocols(CLI::App& command, serve::ServerOptions& server) {
   add_text(command, "--openpi", server.openpi, "ADDRESS:PORT",
@@ -312,6 +321,22 @@ void add_other_protocols(CLI::App& command, serve::ServerOptions& server) {
 }
 
 }  // namespace
+
+CLI::Option* add_limits(CLI::App& command, std::string& file, std::string& on_limit) {
+  CLI::Option* limits =
+      command.add_option("--limits", file, "What the rows of a chunk may be, a file as the control loops read it")
+          ->type_name("FILE")
+          ->check(CLI::ExistingFile);
+  CLI::Option* what =
+      command
+          .add_option("--on-limit", on_limit,
+                      "What becomes of a chunk with rows outside: note, or refuse; required with --limits. One with "
+                      "more of them than the file permits is refused in any case")
+          ->type_name("note|refuse")
+          ->check(CLI::Validator(check_on_limit, ""));
+  what->needs(limits);
+  return limits->needs(what);
+}
 
 Command add_serve(CLI::App& app) {
   auto options = std::make_shared<ServeOptions>();
@@ -374,6 +399,7 @@ Command add_serve(CLI::App& app) {
       ->check(CLI::Range(1, 65536))
       ->capture_default_str();
   command->add_flag("--strict-state", server.strict_state, kStrictStateHelp);
+  add_limits(*command, server.limits, server.on_limit);
   command->add_flag("--insecure", server.insecure, "Allow addresses that other machines reach, without keys");
   command->add_option("--curve-secret", server.curve_secret, "The server's secret key, a file from vla keygen")
       ->check(CLI::ExistingFile);

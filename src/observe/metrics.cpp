@@ -53,7 +53,13 @@ Metrics::Metrics()
       sent_bytes_(counter(*registry_, "vla_sent_bytes_total", "Bytes of answers")),
       clients_(counter(*registry_, "vla_clients_total", "Connections that have sent a request")),
       refused_(counter(*registry_, "vla_refused_clients_total", "Handshakes of clients whose key is not listed")),
-      beyond_(counter(*registry_, "vla_state_beyond_total", "Acts answered though their state is beyond its bound")) {
+      beyond_(counter(*registry_, "vla_state_beyond_total", "Acts answered though their state is beyond its bound")),
+      rows_beyond_(counter(*registry_, "vla_rows_beyond_limits_total", "Rows of chunks outside of the limits")) {
+  auto& chunks = prometheus::BuildCounter()
+                     .Name("vla_chunks_beyond_limits_total")
+                     .Help("Chunks with rows outside of the limits, by what became of them")
+                     .Register(*registry_);
+  chunks_noted_ = &chunks.Add({{"outcome", "noted"}}), chunks_refused_ = &chunks.Add({{"outcome", "refused"}});
   gauges(*registry_, "vla_build_info", "Version of the server").Add({{"version", VLA_VERSION}}).Set(1);
 }
 
@@ -117,6 +123,8 @@ void Metrics::answered(const Answered& answered) try {
   prometheus::Counter*& count = request_[{request.kind, code}];
   if (count == nullptr) count = &requests_.Add({{"kind", kind_name(request.kind)}, {"code", answered.code()}});
   if (answered.out_of_range) beyond_.Increment();
+  rows_beyond_.Increment(answered.n_beyond);
+  if (answered.n_beyond > 0) (answered.error == nullptr ? chunks_noted_ : chunks_refused_)->Increment();
   count->Increment();
   if (answered.stages.empty()) return;
   observe("queue", seconds(answered.started - request.at));

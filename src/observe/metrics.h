@@ -43,7 +43,8 @@ class Metrics final : public Observer {
   prometheus::Family<prometheus::Histogram>& stages_;
   prometheus::Family<prometheus::Counter>& dropped_;
   Gauges &bundles_, &runtimes_, &memory_;
-  prometheus::Counter &received_bytes_, &sent_bytes_, &clients_, &refused_, &beyond_;
+  prometheus::Counter &received_bytes_, &sent_bytes_, &clients_, &refused_, &beyond_, &rows_beyond_;
+  prometheus::Counter *chunks_noted_, *chunks_refused_;  // with rows outside of the limits
   std::mutex mutex_;
   std::multimap<std::string, std::pair<Gauges*, prometheus::Gauge*>> gauges_;  // by policy
   // Of the I/O thread:

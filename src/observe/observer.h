@@ -49,6 +49,7 @@ struct Answered {
   /// act of another protocol would have been. Empty where it was refused in that protocol.
   std::span<const std::byte> in, out;
   bool out_of_range = false;           // answered though the state is beyond the bundle's bound
+  int n_beyond = 0;                    // rows outside of --limits of a chunk that was answered or refused for them
   std::span<const std::string> notes;  // of the chunk: warnings, valid during the call only
   const char* code() const { return error == nullptr ? "ok" : code_name(error->code); }
 };

@@ -6,6 +6,7 @@
 #include <malloc.h>
 
 #include <charconv>
+#include <cmath>
 #include <nlohmann/json.hpp>
 #include <optional>
 
@@ -124,7 +125,8 @@ Json dimensions_json(const google::protobuf::RepeatedPtrField<v1::Dimension>& di
   return json;
 }
 
-Json robot_json(const v1::Description& robot, const std::map<std::string, Page::Range>& ranges) {
+Json robot_json(const v1::Description& robot, const std::map<std::string, Page::Range>& ranges,
+                const std::map<std::string, Page::Range>& limits) {
   Json json = {{"embodiment", robot.embodiment()},
                {"horizon", robot.horizon()},
                {"rate_hz", robot.rate_hz()},
@@ -136,6 +138,10 @@ Json robot_json(const v1::Description& robot, const std::map<std::string, Page::
       one["low"] = found->second.low, one["high"] = found->second.high;
     json["states"].push_back(std::move(one));
   }
+  for (Json& action : json["actions"])
+    if (const auto found = limits.find(action["name"]); found != limits.end())
+      for (const auto& [key, end] : {std::pair{"low", found->second.low[0]}, {"high", found->second.high[0]}})
+        if (std::isfinite(end)) action[key] = end;
   return json;
 }
 
@@ -284,7 +290,8 @@ Result<std::unique_ptr<Page>> Page::open(const std::string& address, bool insecu
 
 std::string Page::url() const { return fmt::format("http://{}/?token={}", address(), sources_.token); }
 
-void Page::describe(const v1::Description& description, const std::map<std::string, Range>& ranges, See see) {
+void Page::describe(const v1::Description& description, const std::map<std::string, Range>& ranges,
+                    const std::map<std::string, Range>& limits, See see) {
   Json json = {{"bundle", description.bundle().name()},
                {"arch", description.bundle().arch()},
                {"device", description.runtime().device()},
@@ -292,8 +299,9 @@ void Page::describe(const v1::Description& description, const std::map<std::stri
                {"kernels", description.runtime().kernels()},
                {"sees", see != nullptr},
                {"robots", Json::array()}};
-  for (const v1::Description& robot : description.embodiments()) json["robots"].push_back(robot_json(robot, ranges));
-  if (json["robots"].empty()) json["robots"].push_back(robot_json(description, ranges));
+  for (const v1::Description& robot : description.embodiments())
+    json["robots"].push_back(robot_json(robot, ranges, limits));
+  if (json["robots"].empty()) json["robots"].push_back(robot_json(description, ranges, limits));
   const std::lock_guard lock(mutex_);
   policy_ = text_of(json);
   see_ = std::move(see);

@@ -38,9 +38,10 @@ class Page final : public Observer {
   /// As Http::open.
   static Result<std::unique_ptr<Page>> open(const std::string& address, bool insecure, Sources sources);
 
-  /// The policy, where its states were in training, by name, and how it sees, if that is known; before the first
-  /// request.
-  void describe(const v1::Description& description, const std::map<std::string, Range>& ranges, See see);
+  /// The policy, where its states were in training and where its actions may be, by name, and how it sees, if that is
+  /// known; before the first request. Infinite ends are none.
+  void describe(const v1::Description& description, const std::map<std::string, Range>& ranges,
+                const std::map<std::string, Range>& limits, See see);
   void answered(const Answered& answered) override;
   /// A request and its answer of a recording. False for one that is no act, which is not shown.
   bool show(const Recording::Record& record);

@@ -19,6 +19,7 @@ struct Answer {
   Clock::time_point started, finished;
   Timing stages;
   bool out_of_range = false;       // the state is beyond the bundle's bound
+  int n_beyond = 0;                // rows of the chunk outside of --limits, also where it was refused for them
   std::vector<std::string> notes;  // of the chunk
   Record record;                   // of an act of another protocol, where one is kept
 };

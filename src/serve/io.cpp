@@ -168,6 +168,7 @@ void Io::deliver(Answer& answer) {
                     .in = native != nullptr ? native->span() : std::as_bytes(std::span(answer.record.request)),
                     .out = std::as_bytes(std::span(native != nullptr ? answer.response : answer.record.response)),
                     .out_of_range = answer.out_of_range,
+                    .n_beyond = answer.n_beyond,
                     .notes = answer.notes};
   job.call->send(answer.response);
   if (answer.error) {

@@ -20,6 +20,7 @@ struct ServerOptions {
   std::size_t max_queue = 64;               // acts
   std::size_t max_connections = 256;        // of each protocol
   bool strict_state = false;                // refuse states beyond the bundle's bound
+  std::string limits, on_limit;             // a file of what chunks may be; then "note" or "refuse"
   std::string default_policy;               // of acts that name none; empty: the only one
 
   // Of the protocols that other clients speak (docs/drop_in.md); an empty address: not served.

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "engine/engine.h"
+#include "serve/chunk_limits.h"
 #include "wire/vla.pb.h"
 
 namespace vla::serve {
@@ -24,7 +25,8 @@ struct ServedPolicy {
   std::string name;
   std::shared_ptr<Engine> engine;
   v1::Description description;
-  std::array<EncodedObservation, 2> encoded;  // one is prepared while the other is computed
+  std::map<const Robot*, ChunkLimits> limits;  // of each robot; none without --limits
+  std::array<EncodedObservation, 2> encoded;   // one is prepared while the other is computed
 };
 
 /// The policies that acts may name. One thread at a time.

@@ -118,6 +118,7 @@ Exchange::Jobs::Limits Server::limits_of(const ServerOptions& options) {
 Result<std::unique_ptr<Server>> Server::open(const ServerOptions& asked, Now now) try {
   VLA_TRY(const ServerOptions options, within_descriptors(asked));
   std::unique_ptr<Server> server(new Server(options, now));
+  VLA_TRY(server->limits_, read_limits(options));
   if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
   for (const Protocol& protocol : kProtocols) {
     if (!protocol.is_wanted(options)) continue;
@@ -152,16 +153,23 @@ v1::Description Server::describe(const std::string& name, const Engine& engine) 
   return description;
 }
 
-std::shared_ptr<ServedPolicy> Server::served(const std::string& name, std::shared_ptr<Engine> engine) const {
+Result<std::shared_ptr<ServedPolicy>> Server::served(const std::string& name, std::shared_ptr<Engine> engine) const {
   auto policy = std::make_shared<ServedPolicy>();
   policy->name = name;
   policy->description = describe(name, *engine);
+  for (const Robot* robot : engine->robots()) {
+    if (!limits_) break;
+    const v1::Description& told = description_of(policy->description, robot->bundle().embodiment());
+    VLA_TRY(ChunkLimits limits, ChunkLimits::of(*limits_, options_, told, policy->description.bundle().name()));
+    policy->limits.emplace(robot, std::move(limits));
+  }
   policy->engine = std::move(engine);
   return policy;
 }
 
 Status Server::add(const std::string& name, std::shared_ptr<Engine> engine) {
-  VLA_TRY([[maybe_unused]] const auto before, policies_.put(served(name, std::move(engine))));
+  VLA_TRY(auto policy, served(name, std::move(engine)));
+  VLA_TRY([[maybe_unused]] const auto before, policies_.put(std::move(policy)));
   return {};
 }
 
@@ -198,7 +206,8 @@ void Server::await_last_act(std::shared_ptr<ServedPolicy> policy) const {
 
 Status Server::load(const std::string& name, std::shared_ptr<Engine> engine) {
   using Replaced = Result<std::shared_ptr<ServedPolicy>>;
-  VLA_TRY(auto before, on_io_thread([this, policy = served(name, std::move(engine))]() -> Replaced {
+  VLA_TRY(auto next, served(name, std::move(engine)));
+  VLA_TRY(auto before, on_io_thread([this, policy = std::move(next)]() -> Replaced {
             VLA_TRY(auto before, policies_.put(policy));
             const auto of_fronts = policies_.find("");
             if (of_fronts && *of_fronts == policy)
@@ -312,11 +321,13 @@ Status Server::prepare(Act& act) const {
 
 Status Server::respond(Act& act) const {
   Answer& answer = act.answer;
-  const ServedPolicy& policy = act.policy();
+  ServedPolicy& policy = act.policy();
   if (!policy.engine->device().is_host()) act.clock.lap(act.encoded().timing, "wait");
   VLA_TRY(ActionChunk chunk, policy.engine->compute(act.encoded()));
   answer.stages.insert(answer.stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = answer.stages;
+  if (const auto limits = policy.limits.find(act.encoded().robot); limits != policy.limits.end())
+    VLA_CHECK(limits->second.check(chunk, answer.n_beyond));
   answer.out_of_range = chunk.out_of_range, answer.notes = chunk.notes;
   act.request.observation.embodiment = act.encoded().robot->bundle().embodiment();
   const double queue_ms = std::chrono::duration<double, std::milli>(answer.started - answer.job.at).count();

@@ -35,10 +35,11 @@ class Server {
   /// The limit of each protocol: lower than asked for where the system gives this process few file descriptors.
   std::size_t max_connections() const { return options_.max_connections; }
 
-  /// A policy that acts may name, before `run`. Errors: incompatible, as Policies::put.
+  /// A policy that acts may name, before `run`. Errors: incompatible, as Policies::put; usage, where --limits are of
+  /// other actions.
   Status add(const std::string& name, std::shared_ptr<Engine> engine);
   /// The same while it runs, from another thread; one of the same name answers what is in line for it, and is gone when
-  /// the call returns. Errors: incompatible, shutting_down.
+  /// the call returns. Errors: as add; shutting_down.
   Status load(const std::string& name, std::shared_ptr<Engine> engine);
   /// Takes a policy away while the server runs, from another thread: returns when its acts are answered and its memory
   /// is free. Errors: bad_observation, usage, as Policies::remove; shutting_down.
@@ -61,6 +62,8 @@ class Server {
   void keep_sizes(SeenSizes* sizes) { sizes_ = sizes; }
   /// The answer to `describe` once this engine is served under this name.
   v1::Description describe(const std::string& name, const Engine& engine) const;
+  /// What chunks may be; none without --limits.
+  const std::optional<control::Limits>& limits() const { return limits_; }
   /// From any thread or signal handler: what waits is refused.
   void stop() noexcept;
   /// From any thread: no act is taken any more, and those in line are answered before the server stops.
@@ -90,7 +93,7 @@ class Server {
   Status prepare(Act& act) const;
   Status respond(Act& act) const;
   void await_last_act(std::shared_ptr<ServedPolicy> policy) const;
-  std::shared_ptr<ServedPolicy> served(const std::string& name, std::shared_ptr<Engine> engine) const;
+  Result<std::shared_ptr<ServedPolicy>> served(const std::string& name, std::shared_ptr<Engine> engine) const;
   /// Runs `work` on the I/O thread. Errors: its own; shutting_down where that thread has ended.
   template <class Work>
   auto on_io_thread(Work work) -> decltype(work());
@@ -98,6 +101,7 @@ class Server {
   static void attempt(Act& act, const Work& work) noexcept;
 
   ServerOptions options_;
+  std::optional<control::Limits> limits_;
   std::span<Observer* const> observers_;
   bool records_ = false;  // one of them does
   SeenSizes* sizes_ = nullptr;
