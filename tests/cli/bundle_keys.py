@@ -6,7 +6,7 @@ from typing import List
 
 import gguf
 
-from vla_cpp.convert.bundle import Key
+from vla_cpp.convert.bundle import BundleWriter, Key, TensorInfo, read_bundle
 
 KINDS = {4: "u32", 5: "u32", 6: "f32", 7: "bool", 8: "string", 10: "u32", 11: "u32", 12: "f64"}
 
@@ -18,3 +18,14 @@ def bundle_keys(path) -> List[Key]:
         for name, field in gguf.GGUFReader(path).fields.items()
         if not name.startswith("GGUF.") and name != "vla.checksum"
     ]
+
+
+def rewritten(source, path, values):
+    """The bundle under another path with other values of some of its keys."""
+    content = read_bundle(str(source))
+    keys = [key._replace(value=values.get(key.name, key.value)) for key in bundle_keys(source)]
+    tensors = [TensorInfo(name, array.shape, content.dtypes[name]) for name, array in content.tensors.items()]
+    with BundleWriter(str(path), keys, tensors) as out:
+        for name, array in content.tensors.items():
+            out.write(name, array)
+    return path
