@@ -182,6 +182,7 @@ def test_without_pipelines_nothing_is_assumed(refusal):
         ("config.json", "input_features", {"observation.images.top": {"type": "VISUAL", "shape": [3, 4, 4]}}, "state_dim: expected 0, since"),
         ("config.json", "input_features", {}, "input_features: expected a VISUAL feature or several"),
         ("vlm/config.json", "model_type", "qwen2_5_vl", "model_type: expected 'qwen3_vl'"),
+        ("vlm/config.json", "tie_word_embeddings", False, "backbone config.json: tie_word_embeddings: expected true, since the checkpoint has no"),
         ("vlm/config.json", "text_config/hidden_act", "gelu", "hidden_act: expected 'silu'"),
         ("vlm/preprocessor_config.json", "image_mean", [0.48, 0.46, 0.41], "image_mean: expected [0.5, 0.5, 0.5]"),
         ("policy_postprocessor.json", "steps/1/config", {"gripper_dim": -1}, "gripper_dim: expected a column from 0 on"),

@@ -8,12 +8,14 @@ Qwen3-VL but neither its config nor its tokenizer: both come with its folder.
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field
 from typing import Dict, Sequence, Tuple
 
 from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
+from ...files import read_json
 from ...lerobot import action_width, check_keys, check_widths, no_position_rule, read_views, state_width
 from ...networks import MAX_LAYERS
 from ...recipe import STATE
@@ -69,6 +71,7 @@ PLACES = ("{instruction}", "{actions}", "{e_actions}")
 FOLDER = "--backbone needs the folder of Qwen/Qwen3-VL-2B-Instruct, or of the model that qwen_model_name names"
 ENCODER = "model.video_encoder.encoder.embeddings.patch_embeddings.proj.weight"
 MAX_TEMPLATE = 1 << 12  # bytes, as the runtime reads one
+EMBEDDING = "model.qwen.model.model.language_model.embed_tokens.weight"
 # What the backbone's processor puts images in the place of; no text may have it.
 PLACEHOLDERS = (qwen3_vl.IMAGE, "<|video_pad|>", "<|placeholder|>")
 
@@ -96,6 +99,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     s = Sizes()
     s.folder = find_backbone(checkpoint, options.backbone, policy.get("qwen_model_name"), "qwen_model_name")
     qwen3_vl.read(s.folder, MAX_LAYERS, s, problems, FOLDER)
+    _check_tie(checkpoint, s.folder, problems)
     s.views, _ = read_views(policy, checkpoint)
     s.max_views = len(s.views)
     _read_images(policy, s, problems)
@@ -106,6 +110,15 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
         policy.bad("torch_dtype", "'bfloat16' or 'float32'", unsupported=True)
     s.in_bf16 = dtype == "bfloat16"
     return s
+
+
+def _check_tie(checkpoint: Checkpoint, folder: str, problems: Problems) -> None:
+    """An embedding that is stored once, as the language head, is what the config must tie it to: else the reference makes a random one."""
+    config = read_json(os.path.join(folder, "config.json"))
+    tied = config.get("tie_word_embeddings")
+    if EMBEDDING in checkpoint.aliases and EMBEDDING not in checkpoint.tensors and tied is not True:
+        found = "nothing" if tied is None else str(tied)
+        problems.add("backbone config.json: tie_word_embeddings", "true, since the checkpoint has no {}".format(EMBEDDING), found)
 
 
 def _read_images(policy: Section, s: Sizes, problems: Problems) -> None:
