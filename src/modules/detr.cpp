@@ -55,4 +55,25 @@ Tensor DetrDecoderLayer::forward(Graph& g, Tensor x, Tensor position, const KeyV
   return ffn_norm_(g, x, [&](Tensor h) { return mlp_(g, h); });
 }
 
+DetrDecoder::DetrDecoder(const Scope& s, const DetrFamily& family, int n_layer) {
+  for (int i = 0; i < n_layer; ++i) layers_.emplace_back(s / "blk" / i, family);
+}
+
+void DetrDecoder::constants(Graph& g, Tensor queries, Tensor position, Cache& cache) const {
+  cache.put(g, "queries", layers_.front().among(g, queries, position));
+}
+
+void DetrDecoder::prefix(Graph& g, Tensor tokens, Tensor position, Cache& cache) const {
+  for (const DetrDecoderLayer& layer : layers_) put(g, cache, layer.path(), layer.project(g, tokens, position));
+}
+
+Tensor DetrDecoder::operator()(Graph& g, Tensor position, const Cache& cache) const {
+  Tensor x = cache.get(g, "queries");
+  for (const DetrDecoderLayer& layer : layers_) {
+    if (&layer != &layers_.front()) x = layer.among(g, x, position);
+    x = layer(g, x, position, get(g, cache, layer.path()));
+  }
+  return x;
+}
+
 }  // namespace vla

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <vector>
+
 #include "modules/attention.h"
 #include "nn/mlp.h"
 
@@ -82,6 +84,22 @@ class DetrDecoderLayer : public Module<DetrDecoderLayer> {
   Attention cross_;
   NormedSum ffn_norm_;
   Mlp mlp_;
+};
+
+/// Decoder layers over queries that no observation changes, each part at its own rate.
+class DetrDecoder {
+ public:
+  DetrDecoder() = default;
+  DetrDecoder(const Scope& s, const DetrFamily& family, int n_layer);
+  /// Load rate: the queries' self-attention in the first layer. queries, position [d_model, n_query].
+  void constants(Graph& g, Tensor queries, Tensor position, Cache& cache) const;
+  /// Observation rate: keys and values of the encoder's tokens in every layer. tokens, position [d_model, n].
+  void prefix(Graph& g, Tensor tokens, Tensor position, Cache& cache) const;
+  /// The queries after all layers: position [d_model, n_query] or none -> [d_model, n_query].
+  Tensor operator()(Graph& g, Tensor position, const Cache& cache) const;
+
+ private:
+  std::vector<DetrDecoderLayer> layers_;
 };
 
 }  // namespace vla

@@ -53,7 +53,7 @@ class Act final : public Policy {
   std::vector<DetrEncoderLayer> encoder_;
   std::optional<LayerNorm> encoder_norm_;
   Embedding query_;  // step rate
-  std::vector<DetrDecoderLayer> decoder_;
+  DetrDecoder decoder_;
   LayerNorm decoder_norm_;
   Linear action_out_;
 
@@ -82,7 +82,7 @@ class Act final : public Policy {
     if (d_environment_ > 0) environment_in_.emplace(s / "environment_in", d_environment_, family_.d_model, Bias::yes);
     const int n_encoder = (s / "encoder").n_layer("n_layer"), n_decoder = (s / "decoder").n_layer("n_layer");
     for (int i = 0; i < n_encoder; ++i) encoder_.emplace_back(s / "encoder" / "blk" / i, family_);
-    for (int i = 0; i < n_decoder; ++i) decoder_.emplace_back(s / "decoder" / "blk" / i, family_);
+    decoder_ = DetrDecoder(s / "decoder", family_, n_decoder);
     if (family_.pre_norm) encoder_norm_.emplace(s / "encoder" / "norm", family_.d_model, family_.norm_eps);
   }
 
@@ -108,7 +108,7 @@ class Act final : public Policy {
   /// Queries start at zero, so the first layer's self-attention is the same for every observation.
   void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {
     const Tensor zero = full(g, 0.0f, family_.d_model, horizon_);
-    cache.put(g, "queries", decoder_.front().among(g, zero, queries(g)));
+    decoder_.constants(g, zero, queries(g), cache);
   }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
@@ -126,16 +126,11 @@ class Act final : public Policy {
     const Tensor position = concat_tokens(g, places);
     for (const DetrEncoderLayer& layer : encoder_) x = layer(g, x, position);
     if (encoder_norm_) x = (*encoder_norm_)(g, x);
-    for (const DetrDecoderLayer& layer : decoder_) put(g, cache, layer.path(), layer.project(g, x, position));
+    decoder_.prefix(g, x, position, cache);
   }
 
   Tensor velocity(Graph& g, Tensor /*x_t*/, Tensor /*condition*/, const Cache& cache) const override {
-    Tensor x = cache.get(g, "queries");
-    for (const DetrDecoderLayer& layer : decoder_) {
-      if (&layer != &decoder_.front()) x = layer.among(g, x, queries(g));
-      x = layer(g, x, queries(g), get(g, cache, layer.path()));
-    }
-    return action_out_(g, decoder_norm_(g, x));  // [d_action, horizon]
+    return action_out_(g, decoder_norm_(g, decoder_(g, queries(g), cache)));  // [d_action, horizon]
   }
 
  private:

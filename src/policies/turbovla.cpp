@@ -27,7 +27,7 @@ class TurboVla final : public Policy {
   std::vector<FusionLayer> fusion_;
   LayerNorm image_norm_, text_norm_;
   Embedding query_;  // step rate
-  std::vector<DetrDecoderLayer> decoder_;
+  DetrDecoder decoder_;
   LayerNorm decoder_norm_;
   Linear action_out_;
 
@@ -57,7 +57,7 @@ class TurboVla final : public Policy {
     }
     const int n_fusion = (s / "fusion").n_layer("n_layer"), n_decoder = (s / "decoder").n_layer("n_layer");
     for (int i = 0; i < n_fusion; ++i) fusion_.emplace_back(s / "fusion" / "blk" / i, family_);
-    for (int i = 0; i < n_decoder; ++i) decoder_.emplace_back(s / "decoder" / "blk" / i, family_);
+    decoder_ = DetrDecoder(s / "decoder", family_, n_decoder);
   }
 
   Status check(const InputShape& shape) const override {
@@ -72,7 +72,7 @@ class TurboVla final : public Policy {
 
   /// Computes the queries' self-attention in the first layer, which is the same for every observation.
   void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {
-    cache.put(g, "queries", decoder_.front().among(g, query_(g, arange(g, horizon_)), {}));
+    decoder_.constants(g, query_(g, arange(g, horizon_)), {}, cache);
   }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
@@ -82,16 +82,11 @@ class TurboVla final : public Policy {
     for (const FusionLayer& layer : fusion_) x = layer(g, x);
     const Tensor seen = image_norm_(g, x.image);
     const Tensor memory = g.name("prefix", concat_tokens(g, {seen, text_norm_(g, x.text)}));
-    for (const DetrDecoderLayer& layer : decoder_) put(g, cache, layer.path(), layer.project(g, memory, {}));
+    decoder_.prefix(g, memory, {}, cache);
   }
 
   Tensor velocity(Graph& g, Tensor /*x_t*/, Tensor /*condition*/, const Cache& cache) const override {
-    Tensor x = cache.get(g, "queries");
-    for (const DetrDecoderLayer& layer : decoder_) {
-      if (&layer != &decoder_.front()) x = layer.among(g, x, {});
-      x = layer(g, x, Tensor(), get(g, cache, layer.path()));
-    }
-    return action_out_(g, decoder_norm_(g, x));  // [d_action, horizon]
+    return action_out_(g, decoder_norm_(g, decoder_(g, {}, cache)));  // [d_action, horizon]
   }
 
  private:

@@ -89,7 +89,7 @@ class TurboVlaAuthors final : public Policy {
   std::vector<BiAttention> fusion_;
   std::vector<DetrEncoderLayer> text_layers_;
   Embedding query_;  // step rate
-  std::vector<DetrDecoderLayer> decoder_;
+  DetrDecoder decoder_;
   Linear action_in_, action_mid_, action_out_;
 
  public:
@@ -128,7 +128,7 @@ class TurboVlaAuthors final : public Policy {
       fusion_.emplace_back(fusion / "blk" / i, both);
       text_layers_.emplace_back(fusion / "blk" / i / "among", text);
     }
-    for (int i = 0; i < n_decoder; ++i) decoder_.emplace_back(s / "decoder" / "blk" / i, family_);
+    decoder_ = DetrDecoder(s / "decoder", family_, n_decoder);
   }
 
   Status check(const InputShape& shape) const override {
@@ -171,7 +171,7 @@ class TurboVlaAuthors final : public Policy {
 
   /// Computes the queries' self-attention of the first layer, and the position embeddings of all patches.
   void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {
-    cache.put(g, "queries", decoder_.front().among(g, query_(g, arange(g, horizon_)), {}));
+    decoder_.constants(g, query_(g, arange(g, horizon_)), {}, cache);
     if (!place_) return;
     const std::int64_t d = family_.d_model, n_patch = vision_.n_patch();
     const Tensor table = (*place_)(g, arange(g, static_cast<int>(n_view_ * n_patch)));
@@ -198,16 +198,12 @@ class TurboVlaAuthors final : public Policy {
       if (padding_ == Padding::zeroed) x.text = without_padding(g, x.text, layout.n_seen);
     }
     const Tensor memory = g.name("prefix", concat_tokens(g, {x.image, x.text, state_in_(g, in.state)}));
-    for (const DetrDecoderLayer& layer : decoder_) put(g, cache, layer.path(), layer.project(g, memory, {}));
+    decoder_.prefix(g, memory, {}, cache);
   }
 
   Tensor velocity(Graph& g, Tensor /*x_t*/, Tensor /*condition*/, const Cache& cache) const override {
-    Tensor x = cache.get(g, "queries");
-    for (const DetrDecoderLayer& layer : decoder_) {
-      if (&layer != &decoder_.front()) x = layer.among(g, x, {});
-      x = layer(g, x, Tensor(), get(g, cache, layer.path()));
-    }
-    x = activate(g, action_mid_(g, activate(g, action_in_(g, x), Activation::relu)), Activation::relu);
+    Tensor x = activate(g, action_in_(g, decoder_(g, {}, cache)), Activation::relu);
+    x = activate(g, action_mid_(g, x), Activation::relu);
     return tanh_of(g, action_out_(g, x));  // [d_action, horizon]
   }
 

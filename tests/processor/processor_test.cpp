@@ -34,6 +34,12 @@ std::string refused_recipe(const char* pointer, const Json& value) {
   return refused_with("processor.recipe", recipe.dump());
 }
 
+/// Puts a WordPiece tokenizer in the place of the sample's BPE.
+void set_wordpiece(EditableBundle& bundle, const Keys& tokenizer) {
+  for (const auto& [key, value] : tokenizer.all()) bundle.set(key, value);
+  for (const char* key : {"tokenizer.pre", "tokenizer.ignore_merges", "tokenizer.merges"}) bundle.remove_key(key);
+}
+
 }  // namespace
 
 TEST_CASE("an observation becomes pixels, tokens and a padded state") {
@@ -406,8 +412,7 @@ TEST_CASE("a text that is cut at its start keeps what stands in front of every t
 TEST_CASE("a text that is cut keeps what stands around every text") {
   EditableBundle bundle = sample();
   const Keys bert = tokenizer_keys("bert");
-  for (const auto& [key, value] : bert.all()) bundle.set(key, value);
-  for (const char* key : {"tokenizer.pre", "tokenizer.ignore_merges", "tokenizer.merges"}) bundle.remove_key(key);
+  set_wordpiece(bundle, bert);
   Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
   Observation seen = observation();
   seen.text = "pick up the red cube and place it in the bowl";
@@ -433,8 +438,7 @@ TEST_CASE("a text that is cut keeps what stands around every text") {
 TEST_CASE("a text is filled up to its limit, which single instructions have of their own") {
   EditableBundle bundle = sample();
   const Keys bert = tokenizer_keys("bert");
-  for (const auto& [key, value] : bert.all()) bundle.set(key, value);
-  for (const char* key : {"tokenizer.pre", "tokenizer.ignore_merges", "tokenizer.merges"}) bundle.remove_key(key);
+  set_wordpiece(bundle, bert);
   Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
   const Json limit = {{"op", "limit"}, {"max_tokens", 5}, {"instructions", {"open it now", "push"}}};
   recipe["text"] = {limit, {{"op", "tokenize"}, {"max_tokens", 8}, {"truncate", "right"}, {"pad_id", 0}}};
