@@ -129,6 +129,11 @@ class Translator {
         return relu(x);
       case Activation::relu_squared:
         return ggml_sqr(c, relu(x));
+      case Activation::mish: {  // x n / (n + 2) with n = (1 + e^x)^2 - 1; the clamp writes to a copy
+        ggml_tensor* power = ggml_exp(c, ggml_clamp(c, ggml_scale(c, x, 1.0f), -100.0f, 20.0f));
+        ggml_tensor* n = ggml_mul(c, power, ggml_scale_bias(c, power, 1.0f, 2.0f));
+        return ggml_mul(c, x, ggml_div(c, n, ggml_scale_bias(c, n, 1.0f, 2.0f)));
+      }
       case Activation::none:
         break;
     }

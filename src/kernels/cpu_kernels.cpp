@@ -18,6 +18,8 @@ RowKernel CpuKernels::activation(Activation activation) const {
       return relu;
     case Activation::relu_squared:
       return relu_squared;
+    case Activation::mish:
+      return mish;
     case Activation::none:
       break;
   }

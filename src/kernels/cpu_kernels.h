@@ -11,7 +11,7 @@ namespace vla::kernels {
 
 /// Everything except matrix products, for one instruction set. Rows are contiguous and need no alignment.
 struct CpuKernels {
-  RowKernel silu, gelu_tanh, gelu_erf, relu, relu_squared;  // math.h, gelu_erf.h
+  RowKernel silu, gelu_tanh, gelu_erf, relu, relu_squared, mish;  // math.h, gelu_erf.h
   /// y = (x - mean) / sqrt(variance + s) * w + b, and y = x / sqrt(mean(x^2) + s) * w + b; w and b may be null.
   RowKernel layer_norm, rms_norm;
   /// Rotates the pairs (x_i, x_{i + n/2}); w has n/2 cosines followed by n/2 sines.

@@ -23,6 +23,7 @@ class CpuKernelsMaker {
         .gelu_erf = map<GeluErf>,
         .relu = map<Relu>,
         .relu_squared = map<ReluSquared>,
+        .mish = map<Mish>,
         .layer_norm = layer_norm,
         .rms_norm = rms_norm,
         .rotate_half = rotate_half,
@@ -51,6 +52,9 @@ class CpuKernelsMaker {
   };
   struct ReluSquared {
     static VLA_INLINE Float of(Float x, Float) { return relu_squared<V>(x); }
+  };
+  struct Mish {
+    static VLA_INLINE Float of(Float x, Float) { return mish<V>(x); }
   };
 
   struct Plus {

@@ -133,6 +133,8 @@ struct LinearStripes {
           return &Finish::write<kWhole, kRounded, Activation::relu>;
         case Activation::relu_squared:
           return &Finish::write<kWhole, kRounded, Activation::relu_squared>;
+        case Activation::mish:
+          return &Finish::write<kWhole, kRounded, Activation::mish>;
       }
       return &Finish::write<kWhole, kRounded, Activation::none>;
     }
@@ -147,6 +149,7 @@ struct LinearStripes {
       if constexpr (kActivation == Activation::silu) return silu<V>(x);
       if constexpr (kActivation == Activation::relu) return relu<V>(x);
       if constexpr (kActivation == Activation::relu_squared) return relu_squared<V>(x);
+      if constexpr (kActivation == Activation::mish) return mish<V>(x);
       return x;
     }
 

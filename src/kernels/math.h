@@ -98,6 +98,18 @@ VLA_INLINE typename V::Float relu_squared(typename V::Float x) {
   return relu<V>(x) * relu<V>(x);
 }
 
+/// x * tanh(ln(1 + e^x)), within four units in the last place down to -80, where it is 1e-33. With t = e^-|x| the
+/// factor is (1 + 2 t) / (1 + 2 t + 2 t^2) for x >= 0, and (t^2 + 2 t) / (t^2 + 2 t + 2) below, so that nothing
+/// cancels. Source: torch mish.
+template <class V>
+VLA_INLINE typename V::Float mish(typename V::Float x) {
+  using Float = typename V::Float;
+  const Float t = exp_of_negative<V>(-size_of<V>(x)), twice = t + t;
+  const Float above = x < 0.0f ? V::fma(t, t, twice) : twice + 1.0f;
+  const Float rest = x < 0.0f ? V::set(2.0f) : twice * t;
+  return x * V::divide(above, above + rest);
+}
+
 /// x / (1 + e^-x), within two units in the last place over the whole range. Source: torch silu.
 template <class V>
 VLA_INLINE typename V::Float silu(typename V::Float x) {

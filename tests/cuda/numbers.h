@@ -71,6 +71,8 @@ inline double activated(Activation activation, double x) {
       return std::fmax(x, 0);
     case Activation::relu_squared:
       return std::fmax(x, 0) * std::fmax(x, 0);
+    case Activation::mish:
+      return x * std::tanh(std::log1p(std::exp(x)));
   }
   return x;
 }

@@ -215,7 +215,8 @@ TEST_CASE("elements are added, multiplied and copied with repeated dimensions, i
   const Device<float> ga(a), gb(b), y(a.size());
   const Device<std::uint16_t> half(a.size());
   for (MapOperation operation : {MapOperation::copy, MapOperation::add, MapOperation::multiply})
-    for (Activation activation : {Activation::none, Activation::silu, Activation::gelu_erf, Activation::relu_squared}) {
+    for (Activation activation :
+         {Activation::none, Activation::silu, Activation::gelu_erf, Activation::relu_squared, Activation::mish}) {
       // a as [w, h, c]; b has h only; y as [c, w, h].
       MapJob job = {ga.get(),      gb.get(), y.get(),   {w, h, c, 1, 1, 1}, {1, w, w * h}, {0, 1, 0},
                     {c, c * w, 1}, 0.5f,     operation, activation,         false};

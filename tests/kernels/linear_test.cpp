@@ -30,7 +30,8 @@ constexpr Shape kShapes[] = {{1, 1, 1},    {1, 33, 17},   {2, 3, 31},     {3, 17
                              {270, 5, 9},  {1, 1537, 70}, {7, 760, 1100}, {70, 800, 40}};
 
 constexpr Activation kActivations[] = {Activation::none, Activation::gelu_tanh, Activation::gelu_erf,
-                                       Activation::silu, Activation::relu,      Activation::relu_squared};
+                                       Activation::silu, Activation::relu,      Activation::relu_squared,
+                                       Activation::mish};
 
 /// Numbers behind one that is skipped, so that the first is at no round address.
 struct Numbers : test::Numbers {
@@ -44,6 +45,7 @@ double activate(Activation activation, double x) {
   if (activation == Activation::gelu_erf) return x / 2 * std::erfc(-x * M_SQRT1_2);
   if (activation == Activation::relu) return std::max(x, 0.0);
   if (activation == Activation::relu_squared) return std::max(x, 0.0) * std::max(x, 0.0);
+  if (activation == Activation::mish) return x * std::tanh(std::log1p(std::exp(x)));
   return x;
 }
 

@@ -21,6 +21,7 @@ using Function = double (*)(double);
 double silu(double x) { return x / (1 + std::exp(-x)); }
 double gelu_tanh(double x) { return x / (1 + std::exp(-2 * std::sqrt(2 / M_PI) * (x + 0.044715 * x * x * x))); }
 double gelu_erf(double x) { return x / 2 * std::erfc(-x * M_SQRT1_2); }
+double mish(double x) { return x * std::tanh(std::log1p(std::exp(x))); }
 
 /// The distance of neighbouring float32 numbers where `exact` lies.
 double unit(double exact) {
@@ -62,9 +63,20 @@ void check_accuracy(const CpuKernels& kernels) {
   CHECK(worst_error(kernels.gelu_erf, gelu_erf) <= 2);
 }
 
+/// Below -80 float32 leaves the normal numbers on the way.
+void check_mish(const CpuKernels& kernels) {
+  const std::vector<float> x = numbers();
+  std::vector<float> y(x.size());
+  kernels.mish(x.data(), nullptr, nullptr, 0, y.data(), static_cast<std::int64_t>(x.size()));
+  for (std::size_t i = 0; i < x.size(); ++i) {
+    const double expected = mish(x[i]), most = x[i] < -80 ? 1e-32 : 4 * unit(expected);
+    if (!(std::abs(y[i] - expected) <= most)) FAIL_CHECK(x[i] << ": " << y[i]);
+  }
+}
+
 void check_not_finite(const CpuKernels& kernels) {
   const float infinity = std::numeric_limits<float>::infinity(), nan = std::numeric_limits<float>::quiet_NaN();
-  for (kernels::RowKernel map : {kernels.silu, kernels.gelu_tanh, kernels.gelu_erf}) {
+  for (kernels::RowKernel map : {kernels.silu, kernels.gelu_tanh, kernels.gelu_erf, kernels.mish}) {
     const float x[] = {infinity, -infinity, nan};
     float y[3] = {};
     map(x, nullptr, nullptr, 0, y, 3);
@@ -108,6 +120,7 @@ void check_ends(const CpuKernels& kernels) {
 }  // namespace
 
 VLA_KERNEL_TEST("silu and gelu are within two units in the last place over the whole range", check_accuracy)
+VLA_KERNEL_TEST("mish is within four units in the last place down to -80", check_mish)
 VLA_KERNEL_TEST("relu and its square keep what is above zero, and NaN", check_relu)
 VLA_KERNEL_TEST("what is not finite stays so", check_not_finite)
 VLA_KERNEL_TEST("a row of any length is mapped from its first number to its last, and nothing beyond", check_ends)

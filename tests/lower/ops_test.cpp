@@ -9,8 +9,8 @@ using namespace vla::test;
 
 namespace {
 
-constexpr Activation kActivations[] = {Activation::gelu_tanh, Activation::gelu_erf, Activation::silu, Activation::relu,
-                                       Activation::relu_squared};
+constexpr Activation kActivations[] = {Activation::gelu_tanh, Activation::gelu_erf,     Activation::silu,
+                                       Activation::relu,      Activation::relu_squared, Activation::mish};
 
 /// Contiguous, and a part of something wider.
 constexpr Tensor (*kOperands[])(GraphRunner&, const Shape&, float) = {input, strided};

@@ -8,12 +8,16 @@
 namespace vla::cuda {
 
 /// Within a few units in the last place. Written without a switch, because nvcc would build a jump table at every use.
-/// Sources: torch silu, gelu, relu.
+/// Sources: torch silu, gelu, relu, mish.
 VLA_DEVICE float activate(Activation activation, float x) {
   if (activation == Activation::none) return x;
   if (activation == Activation::gelu_erf) return 0.5f * x * (1 + erff(0.70710678f * x));
   if (activation == Activation::relu) return x < 0 ? 0 : x;
   if (activation == Activation::relu_squared) return x < 0 ? 0 : x * x;
+  if (activation == Activation::mish) {  // as kernels/math.h
+    const float t = expf(-fabsf(x)), above = x < 0 ? t * (t + 2) : 1 + 2 * t;
+    return x * (above / (above + (x < 0 ? 2 : 2 * t * t)));
+  }
   // x / (1 + e^-u). With u = x this is SiLU; since 1 + tanh(u / 2) = 2 / (1 + e^-u), it also gives GELU's tanh form.
   const float u = activation == Activation::silu ? x : 1.5957691216f * (x + 0.044715f * x * x * x);
   return x / (1 + expf(-u));
