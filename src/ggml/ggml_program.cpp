@@ -158,6 +158,12 @@ class Translator {
     return ggml_repeat_4d(c, contiguous(in(0)), s[0], s[1], s[2], s[3]);
   }
   ggml_tensor* translate(const op::Reshape&) { return reshaped(in(0), node_->shape); }
+  /// ggml asks where each dimension of x goes, and not all of its operations read rows that are not contiguous.
+  ggml_tensor* translate(const op::Permute& op) {
+    std::array<int, 4> to{};
+    for (int i = 0; i < 4; ++i) to[static_cast<std::size_t>(op.order[static_cast<std::size_t>(i)])] = i;
+    return ggml_cont(c, ggml_permute(c, in(0), to[0], to[1], to[2], to[3]));
+  }
   ggml_tensor* translate(const op::Patches& op) {
     ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, op.size, op.size, 3, 1);  // only its shape is read
     ggml_tensor* rows = ggml_im2col(c, kernel, contiguous(in(0)), op.size, op.size, 0, 0, 1, 1, true, GGML_TYPE_F32);

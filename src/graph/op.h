@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <array>
 #include <memory>
 #include <variant>
 #include <vector>
@@ -112,6 +113,11 @@ struct Repeat {
 struct Reshape {
   static constexpr const char* kName = "reshape";
 };
+/// Dimension i of the result is dimension order[i] of x.
+struct Permute {
+  static constexpr const char* kName = "permute";
+  std::array<int, 4> order;
+};
 /// images [width, height, 3, n_view] -> pixels of non-overlapping patches, row by row: [3 * size^2, n_patch, n_view]. A
 /// patch is ordered by channel, row, column.
 struct Patches {
@@ -168,8 +174,8 @@ namespace vla {
 
 using Op = std::variant<op::Input, op::Constant, op::Parameter, op::Linear, op::Embedding, op::Gather, op::Norm,
                         op::Rope, op::Attention, op::Activate, op::Add, op::Multiply, op::Scale, op::Concat, op::Slice,
-                        op::Repeat, op::Reshape, op::Patches, op::PixelShuffle, op::Unfold, op::MaxPool, op::Depthwise,
-                        op::ChannelAttention, op::Write>;
+                        op::Repeat, op::Reshape, op::Permute, op::Patches, op::PixelShuffle, op::Unfold, op::MaxPool,
+                        op::Depthwise, op::ChannelAttention, op::Write>;
 
 /// The operation's name in messages and printed graphs.
 inline const char* op_name(const Op& op) {

@@ -106,6 +106,14 @@ struct Rules {
     if (!has(1)) return {false};
     return {count(asked) == count(of(0)), asked, in[0].node()->type};
   }
+  ShapeCheck operator()(const op::Permute& op) const {
+    std::array<int, 4> sorted = op.order;
+    std::sort(sorted.begin(), sorted.end());
+    if (!has(1) || !floats() || sorted != std::array{0, 1, 2, 3}) return {false};
+    Shape shape;
+    for (std::size_t i = 0; i < 4; ++i) shape[i] = of(0)[static_cast<std::size_t>(op.order[i])];
+    return {true, shape};
+  }
   ShapeCheck operator()(const op::Patches& op) const {
     if (!has(1) || !floats() || of(0)[2] != 3) return {false};
     const std::int64_t p = op.size, n = (of(0)[0] / p) * (of(0)[1] / p);

@@ -84,6 +84,8 @@ struct Lowering {
 std::size_t stage_of(const Lowering& l, const Step& step);
 /// Strides of contiguous elements.
 Shape contiguous_strides(const Shape& shape);
+/// Of each of the result's dimensions: its size or stride in x.
+Shape permuted(const Shape& of_x, const op::Permute& permute);
 bool is_contiguous(const Shape& shape, const Shape& stride);
 inline bool is_contiguous(const Value& value) { return is_contiguous(value.shape, value.stride); }
 /// Copies the elements of a value into contiguous memory.

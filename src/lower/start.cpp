@@ -11,6 +11,12 @@ Shape contiguous_strides(const Shape& shape) {
   return {1, shape[0], shape[0] * shape[1], shape[0] * shape[1] * shape[2]};
 }
 
+Shape permuted(const Shape& of_x, const op::Permute& permute) {
+  Shape result;
+  for (std::size_t i = 0; i < 4; ++i) result[i] = of_x[static_cast<std::size_t>(permute.order[i])];
+  return result;
+}
+
 bool is_contiguous(const Shape& shape, const Shape& stride) {
   const Shape packed = contiguous_strides(shape);
   for (std::size_t i = 0; i < 4; ++i)
@@ -120,6 +126,9 @@ struct MakeValue {
   Value operator()(const op::Reshape&) const {
     const auto stride = reshape_strides(x(), node.shape);
     return must_copy() || !stride ? own(node) : view(node, x(), *stride, 0);
+  }
+  Value operator()(const op::Permute& op) const {
+    return must_copy() ? own(node) : view(node, x(), permuted(x().stride, op), 0);
   }
 
   /// All other nodes compute something.

@@ -9,17 +9,56 @@ namespace vla {
 /// Reorders pixels so that features come first: [width, height, d, n_view] -> [d, width, height, n_view], for d = 3.
 Tensor pixels_first(Graph& g, Tensor images);
 
-/// A convolution with bias, computed as a product over unfolded windows: x [d_in, width, height, n_view] -> [d_out,
+/// A convolution, computed as a product over unfolded windows: x [d_in, width, height, n_view] -> [d_out,
 /// n_column, n_row, n_view], with size / 2 zeros of padding on each side. Matrix columns are ordered by row, column,
 /// feature. Source: torch.nn.Conv2d(padding = kernel_size // 2).
 class Convolution : public Module<Convolution> {
  public:
-  Convolution(const Scope& s, int d_in, int d_out, int size, int stride);
+  Convolution(const Scope& s, int d_in, int d_out, int size, int stride, Bias bias = Bias::yes);
   Tensor forward(Graph& g, Tensor x) const;
 
  private:
   op::Window window_;
   Linear product_;
+};
+
+/// A convolution over tokens in their order with bias: x [d_in, n] -> [d_out, n], with size / 2 zeros of padding on
+/// each side. Matrix columns are ordered by place in the window, then by feature. Source: torch.nn.Conv1d(padding =
+/// kernel_size // 2).
+class TokenConvolution : public Module<TokenConvolution> {
+ public:
+  /// `size` is odd.
+  TokenConvolution(const Scope& s, int d_in, int d_out, int size)
+      : Module(s), size_(size), product_(s, size * d_in, d_out, Bias::yes) {}
+  Tensor forward(Graph& g, Tensor x) const;
+
+ private:
+  int size_;
+  Linear product_;
+};
+
+/// Halves an even number of tokens: x [d, n] -> [d, n / 2]. Matrix columns are ordered as those of TokenConvolution.
+/// Source: torch.nn.Conv1d(kernel_size = 3, stride = 2, padding = 1).
+class HalvingConvolution : public Module<HalvingConvolution> {
+ public:
+  HalvingConvolution(const Scope& s, int d) : Module(s), product_(s, 3 * d, d, Bias::yes) {}
+  Tensor forward(Graph& g, Tensor x) const;
+
+ private:
+  Linear product_;
+};
+
+/// Doubles the number of tokens: x [d, n] -> [d, 2 n]. Tokens at even places are made of x_{i - 1} and x_i by the
+/// matrix `even`, those at odd places of x_i and x_{i + 1} by `odd`, whose columns are ordered so; beyond the ends are
+/// zeros. Source: torch.nn.ConvTranspose1d(kernel_size = 4, stride = 2, padding = 1).
+class DoublingConvolution : public Module<DoublingConvolution> {
+ public:
+  DoublingConvolution(const Scope& s, int d)
+      : Module(s), even_(s / "even", 2 * d, d, Bias::yes), odd_(s / "odd", 2 * d, d, Bias::yes) {}
+  Tensor forward(Graph& g, Tensor x) const;
+
+ private:
+  Linear even_, odd_;
 };
 
 /// A depthwise convolution with bias: x [d, width, height, n_view] -> the same shape, with size / 2 zeros of padding on

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <array>
 #include <vector>
 
 #include "graph/graph.h"
@@ -47,6 +48,10 @@ inline Tensor activate(Graph& g, Tensor x, Activation activation) { return g.add
 /// x / (1 + exp(-x)).
 inline Tensor silu(Graph& g, Tensor x) { return activate(g, x, Activation::silu); }
 
+/// Dimension i of the result is dimension order[i] of x.
+inline Tensor permute(Graph& g, Tensor x, const std::array<int, 4>& order) { return g.add(op::Permute{order}, {x}); }
+/// The same elements in the same order.
+inline Tensor reshape(Graph& g, Tensor x, const Shape& shape) { return g.add(op::Reshape{}, {x}, shape); }
 /// All tokens of all views as one sequence: [d, n, n_view] -> [d, n * n_view].
 Tensor flatten_views(Graph& g, Tensor x);
 /// Puts the same tokens before those of every view: tokens [d, n_first], x [d, n, n_view] -> [d, n_first + n, n_view].

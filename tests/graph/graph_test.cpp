@@ -120,6 +120,9 @@ TEST_CASE_FIXTURE(Fixture, "parts are joined and cut along one dimension") {
   refuses(op::Repeat{}, {a}, {3, 8, 2, 1});
   accepts(op::Reshape{}, {a}, {12, 2, 1, 1}, {12, 2, 1, 1});
   refuses(op::Reshape{}, {a}, {12, 3, 1, 1});
+  accepts(op::Permute{{2, 0, 3, 1}}, {a}, {2, 3, 1, 4});
+  refuses(op::Permute{{2, 0, 2, 1}}, {a});
+  refuses(op::Permute{{1, 2, 3, 4}}, {a});
 }
 
 TEST_CASE_FIXTURE(Fixture, "features attend to those of their group, of which each has at most 64") {

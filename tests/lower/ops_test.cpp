@@ -16,7 +16,6 @@ constexpr Activation kActivations[] = {Activation::gelu_tanh, Activation::gelu_e
 constexpr Tensor (*kOperands[])(GraphRunner&, const Shape&, float) = {input, strided};
 
 Tensor norm(Graph& g, op::NormKind kind, std::vector<Tensor> in) { return g.add(op::Norm{kind, 1e-5f}, std::move(in)); }
-Tensor reshape(Graph& g, Tensor x, const Shape& shape) { return g.add(op::Reshape{}, {x}, shape); }
 
 }  // namespace
 
@@ -112,6 +111,25 @@ TEST_CASE("views of views in every shape that holds as many numbers") {
     check_like_ggml([&](GraphRunner& r, const LowerParams&) {
       return scale(r.graph, r.graph.add(op::Repeat{}, {input(r, from)}, {6, 4, 5, 1}), 2);
     });
+}
+
+TEST_CASE("dimensions in another order, for every reader") {
+  for (const std::array<int, 4>& order :
+       {std::array{0, 2, 1, 3}, std::array{1, 0, 2, 3}, std::array{3, 1, 0, 2}, std::array{2, 3, 1, 0}})
+    for (const auto operand : kOperands) {
+      const auto moved = [&](GraphRunner& r) { return r.graph.add(op::Permute{order}, {operand(r, {6, 4, 5, 2}, 1)}); };
+      check_like_ggml([&](GraphRunner& r, const LowerParams&) { return moved(r); });
+      check_like_ggml([&](GraphRunner& r, const LowerParams&) { return scale(r.graph, moved(r), 2); });
+      check_like_ggml([&](GraphRunner& r, const LowerParams&) {
+        return norm(r.graph, op::NormKind::layer, {reshape(r.graph, moved(r), {60, 4, 1, 1})});
+      });
+      check_like_ggml([&](GraphRunner& r, const LowerParams&) {
+        return slice(r.graph, concat(r.graph, {moved(r), moved(r)}, 1), 1, 1, 2);
+      });
+      check_like_ggml([&](GraphRunner& r, const LowerParams& p) {
+        return p.linear(r.graph, reshape(r.graph, moved(r), {24, 10, 1, 1}), 48);
+      });
+    }
 }
 
 TEST_CASE("rows of tables by ids, of which some are cut off") {

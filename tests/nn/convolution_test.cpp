@@ -8,6 +8,7 @@
 
 #include <cmath>
 
+#include "nn/group_norm.h"
 #include "nn/sine_positions.h"
 #include "support/graph_runner.h"
 #include "support/param_set.h"
@@ -62,6 +63,109 @@ TEST_CASE("a convolution is the sum over its window, of a matrix with columns ro
             CHECK(std::abs(got[place++] - sum) <= 1e-5);
           }
   }
+}
+
+namespace {
+
+/// Numbers of tokens [d, n], zero beyond them.
+struct Tokens {
+  int d, n;
+  std::vector<float> values;
+  double at(int token, int i) const {
+    return token < 0 || token >= n ? 0 : double{values[static_cast<std::size_t>(token * d + i)]};
+  }
+};
+
+/// Element (o, column) of a matrix with rows of `d_in`.
+double element(const std::vector<float>& matrix, int d_in, int o, int column) {
+  return double{matrix[static_cast<std::size_t>(o * d_in + column)]};
+}
+
+}  // namespace
+
+TEST_CASE("a convolution over tokens is the sum over its window, also one that is wider than the tokens are many") {
+  constexpr int kIn = 3, kOut = 5;
+  for (const auto& [size, n] : {std::pair{1, 4}, std::pair{3, 6}, std::pair{5, 8}, std::pair{7, 2}}) {
+    const Tokens x = {kIn, n, ramp(static_cast<std::size_t>(kIn * n), 1)};
+    const std::vector<float> weight = ramp(static_cast<std::size_t>(size * kIn * kOut), 0.3f), bias = ramp(kOut, 1);
+    ParamSet set({{"c.weight", {size * kIn, kOut}, weight}, {"c.bias", {kOut}, bias}});
+    const TokenConvolution convolution(set.scope() / "c", kIn, kOut, size);
+    const auto got = run_graph(set.list(), [&, n = n](Graph& g) {
+      return convolution(g, constant(g, x.values, {kIn, n}));
+    });
+    REQUIRE(got.size() == static_cast<std::size_t>(kOut * n));
+    for (int t = 0; t < n; ++t)
+      for (int o = 0; o < kOut; ++o) {
+        double sum = double{bias[static_cast<std::size_t>(o)]};
+        for (int k = 0; k < size; ++k)
+          for (int i = 0; i < kIn; ++i) sum += element(weight, size * kIn, o, k * kIn + i) * x.at(t + k - size / 2, i);
+        CHECK(std::abs(got[static_cast<std::size_t>(t * kOut + o)] - sum) <= 1e-5);
+      }
+  }
+}
+
+TEST_CASE("tokens are halved and doubled as torch does it") {
+  constexpr int kWidth = 3;
+  for (const int n : {2, 6}) {
+    const Tokens x = {kWidth, n, ramp(static_cast<std::size_t>(kWidth * n), 1)};
+    const std::vector<float> three = ramp(3 * kWidth * kWidth, 0.3f), even = ramp(2 * kWidth * kWidth, 0.4f),
+                             odd = ramp(2 * kWidth * kWidth, 0.5f), bias = ramp(kWidth, 1);
+    ParamSet set({{"h.weight", {3 * kWidth, kWidth}, three},
+                  {"h.bias", {kWidth}, bias},
+                  {"d.even.weight", {2 * kWidth, kWidth}, even},
+                  {"d.even.bias", {kWidth}, bias},
+                  {"d.odd.weight", {2 * kWidth, kWidth}, odd},
+                  {"d.odd.bias", {kWidth}, bias}});
+    const HalvingConvolution halve(set.scope() / "h", kWidth);
+    const DoublingConvolution twice(set.scope() / "d", kWidth);
+    const auto run = [&](const auto& module) {
+      return run_graph(set.list(), [&](Graph& g) { return module(g, constant(g, x.values, {kWidth, n})); });
+    };
+    const auto half = run(halve), doubled = run(twice);
+    REQUIRE(half.size() == static_cast<std::size_t>(kWidth * n / 2));
+    REQUIRE(doubled.size() == static_cast<std::size_t>(kWidth * n * 2));
+    for (int o = 0; o < kWidth; ++o) {
+      for (int t = 0; t < n / 2; ++t) {
+        double sum = double{bias[static_cast<std::size_t>(o)]};
+        for (int k = 0; k < 3; ++k)
+          for (int i = 0; i < kWidth; ++i)
+            sum += element(three, 3 * kWidth, o, k * kWidth + i) * x.at(2 * t + k - 1, i);
+        CHECK(std::abs(half[static_cast<std::size_t>(t * kWidth + o)] - sum) <= 1e-5);
+      }
+      for (int t = 0; t < 2 * n; ++t) {
+        const std::vector<float>& matrix = t % 2 == 0 ? even : odd;
+        double sum = double{bias[static_cast<std::size_t>(o)]};
+        for (int k = 0; k < 2; ++k)
+          for (int i = 0; i < kWidth; ++i)
+            sum += element(matrix, 2 * kWidth, o, k * kWidth + i) * x.at((t + 1) / 2 - 1 + k, i);
+        CHECK(std::abs(doubled[static_cast<std::size_t>(t * kWidth + o)] - sum) <= 1e-5);
+      }
+    }
+  }
+}
+
+TEST_CASE("a group of features is normed over all places of a view") {
+  constexpr int kWidth = 6, kGroup = 2, kPlace = 12, kView = 2;
+  const std::vector<float> x = ramp(kWidth * kPlace * kView, 3), weight = ramp(kWidth, 2), bias = ramp(kWidth, 1);
+  ParamSet set({{"n.weight", {kWidth}, weight}, {"n.bias", {kWidth}, bias}});
+  const GroupNorm norm(set.scope() / "n", kWidth, kGroup, 1e-5f);
+  const auto got = run_graph(set.list(), [&](Graph& g) { return norm(g, constant(g, x, {kWidth, 3, 4, kView})); });
+  REQUIRE(got.size() == x.size());
+  constexpr int kIn = kWidth / kGroup;
+  for (int view = 0; view < kView; ++view)
+    for (int group = 0; group < kGroup; ++group) {
+      const auto each = [&](const auto& see) {
+        for (int place = 0; place < kPlace; ++place)
+          for (int i = group * kIn; i < (group + 1) * kIn; ++i)
+            see(static_cast<std::size_t>((view * kPlace + place) * kWidth + i), static_cast<std::size_t>(i));
+      };
+      double sum = 0, square = 0;
+      each([&](std::size_t at, std::size_t) { sum += double{x[at]}, square += double{x[at]} * x[at]; });
+      const double mean = sum / (kPlace * kIn), deviation = std::sqrt(square / (kPlace * kIn) - mean * mean + 1e-5);
+      each([&](std::size_t at, std::size_t i) {
+        CHECK(std::abs(got[at] - ((double{x[at]} - mean) / deviation * weight[i] + bias[i])) <= 1e-5);
+      });
+    }
 }
 
 TEST_CASE("planes of an image become its pixels one after the other") {

@@ -72,6 +72,11 @@ CopyOp lowered(const Lowering& l, const Node& node, const op::Repeat&) {
   return {&node, {{operand(node, 0), node.shape, from, contiguous_strides(node.shape)}}};
 }
 
+CopyOp lowered(const Lowering& l, const Node& node, const op::Permute& permute) {
+  const Shape from = permuted(l.value(operand(node, 0)).stride, permute);
+  return {&node, {{operand(node, 0), node.shape, from, contiguous_strides(node.shape)}}};
+}
+
 CopyOp lowered(const Lowering& l, const Node& node, const op::Reshape&) { return {&node, {whole_operand(l, node)}}; }
 
 }  // namespace vla::lower

@@ -45,5 +45,6 @@ CopyOp lowered(const Lowering& l, const Node& node, const op::Patches& patches);
 CopyOp lowered(const Lowering& l, const Node& node, const op::Slice& slice);
 CopyOp lowered(const Lowering& l, const Node& node, const op::Repeat& repeat);
 CopyOp lowered(const Lowering& l, const Node& node, const op::Reshape& reshape);
+CopyOp lowered(const Lowering& l, const Node& node, const op::Permute& permute);
 
 }  // namespace vla::lower
