@@ -45,6 +45,8 @@ float wave_exponent(float i, float n, TimeWaves waves) {
   switch (waves) {
     case TimeWaves::cosines_first:
       return -ln * i / (n - 1);
+    case TimeWaves::sines_to_last:
+      return -i * static_cast<float>(std::log(10000.0) / (static_cast<double>(n) - 1));
     case TimeWaves::sines_first:
       return -i * (ln / n);
     case TimeWaves::slow_cosines:
@@ -63,7 +65,8 @@ std::vector<float> wave_embedding(std::span<const float> times, int d, TimeWaves
       for (int i = 0; i < half; ++i) {
         const float exponent = wave_exponent(static_cast<float>(i), static_cast<float>(half), waves);
         const double angle = time * static_cast<float>(std::exp(double{exponent}));
-        const bool cosine = first == (waves != TimeWaves::sines_first);
+        const bool sines_first = waves == TimeWaves::sines_first || waves == TimeWaves::sines_to_last;
+        const bool cosine = first != sines_first;
         table.push_back(static_cast<float>(cosine ? std::cos(angle) : std::sin(angle)));
       }
     if (d % 2 == 1) table.push_back(0.0f);
