@@ -104,8 +104,11 @@ void print_numbers(const std::vector<Description::Number>& numbers, const StatsC
 
 void print_features(const Description& d, const Robot& robot) {
   const Recipe& recipe = robot.processor().recipe();
-  say(stdout, "views        any size, {} to {} x {}; at least {} of {} must be present\n", recipe.fit->described(),
-      recipe.width, recipe.height, d.min_views, d.views.size());
+  if (d.views.empty())
+    say(stdout, "views        none\n");
+  else
+    say(stdout, "views        any size, {} to {} x {}; at least {} of {} must be present\n", recipe.fit->described(),
+        recipe.width, recipe.height, d.min_views, d.views.size());
   for (const auto& view : d.views)
     say(stdout, "    {}{}{}\n", view.name, view.alias.empty() ? "" : fmt::format("  (also {})", view.alias),
         view.camera_width > 0 ? fmt::format("  the checkpoint's is {} x {}", view.camera_width, view.camera_height)

@@ -216,7 +216,7 @@ Status Engine::encode(const Observation& observation, const Noise& noise, const 
 
 Status Engine::send_ahead(EncodedObservation& encoded) const noexcept try {
   const std::vector<float>& pixels = encoded.inputs.pixels;
-  encoded.pixels_ahead = device_->send(pixels.data(), pixels.size() * sizeof(float));
+  if (!pixels.empty()) encoded.pixels_ahead = device_->send(pixels.data(), pixels.size() * sizeof(float));
   return {};
 } catch (const std::bad_alloc&) {
   return no_memory();
@@ -272,7 +272,7 @@ Result<ActionChunk> Engine::run(EncodedObservation& encoded) {
   last_ = {&robot, robot.shape_of(encoded)};
   VLA_TRY(Plan * plan, plans_->for_shape(robot.network(), last_->second));
   set_inputs(*plan, encoded);
-  record(taps, "pixels", {in.width, in.height, 3, in.n_view}, in.pixels);
+  if (in.n_view > 0) record(taps, "pixels", {in.width, in.height, 3, in.n_view}, in.pixels);
   if (!in.tokens.empty()) record(taps, "tokens", {static_cast<std::int64_t>(in.tokens.size())}, in.tokens);
   if (!in.state.empty()) record(taps, "state", {static_cast<std::int64_t>(in.state.size())}, in.state);
   clock.lap(timing, "plan");

@@ -45,7 +45,7 @@ Tensor after(Graph& g, Tensor k, int n_step) {
 Plan::Plan(const Network& network, const InputShape& shape, const PlanContext& context)
     : tap_pattern_(context.tap_pattern),
       device_(context.device),
-      images_(slots_.add_f32({shape.width, shape.height, 3, shape.n_view})),
+      images_(shape.n_view > 0 ? slots_.add_f32({shape.width, shape.height, 3, shape.n_view}) : nullptr),
       tokens_(shape.n_text > 0 ? slots_.add_i32({shape.n_text, 1, 1, 1}) : nullptr),
       state_(shape.d_state > 0 ? slots_.add_f32({shape.d_state, 1, 1, 1}) : nullptr),
       x_(slots_.add_f32({network.d_action, network.horizon, 1, 1})),
@@ -97,8 +97,8 @@ Status Plan::lower(const Network& network, const PlanContext& context) {
     for (const Graph* graph : {&prefix, &step}) context.see_graph(*graph);
   VLA_CHECK(injection_.check());
   VLA_CHECK(device_.allocate(slots_));
-  LowerOptions varying = {{images_}, context.see_tap};
-  for (const Slot* slot : {tokens_, state_})
+  LowerOptions varying = {{}, context.see_tap};
+  for (const Slot* slot : {images_, tokens_, state_})
     if (slot != nullptr) varying.varying.push_back(slot);
   for (const Slot* slot : injection_.slots()) varying.varying.push_back(slot), changing.varying.push_back(slot);
   VLA_TRY(prefix_, device_.lower(prefix, varying));
@@ -117,7 +117,7 @@ void Plan::set_inputs(std::span<const float> pixels, const Device::Sent* ahead, 
                       std::span<const float> state) {
   if (ahead != nullptr)
     device_.take(*images_, *ahead);
-  else
+  else if (images_ != nullptr)
     device_.set(*images_, pixels.data(), pixels.size_bytes());
   if (tokens_ != nullptr) device_.set(*tokens_, tokens.data(), tokens.size_bytes());
   if (state_ != nullptr) device_.set(*state_, state.data(), state.size_bytes());

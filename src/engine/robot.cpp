@@ -95,7 +95,7 @@ InputShape Robot::largest_shape() const {
           .n_view = n_view,
           .n_text = recipe.max_tokens,
           .d_state = d_state_,
-          .views = view_key(~std::uint64_t{0} >> (64 - n_view))};
+          .views = view_key(n_view > 0 ? ~std::uint64_t{0} >> (64 - n_view) : 0)};
 }
 
 InputShape Robot::shape_of(const EncodedObservation& observation) const {
@@ -141,7 +141,7 @@ Status Robot::encode(const Observation& observation, const Noise& noise, const s
 Result<EncodedObservation> Robot::zeros(const InputShape& shape) const {
   const InputShape most = largest_shape();
   const bool fits = shape.width == most.width && shape.height == most.height && shape.d_state == most.d_state &&
-                    shape.n_view > 0 && shape.n_view <= most.n_view && shape.n_text >= 0 &&
+                    shape.n_view >= std::min(1, most.n_view) && shape.n_view <= most.n_view && shape.n_text >= 0 &&
                     shape.n_text <= most.n_text && view_key(shape.views) == shape.views &&
                     (!shape.steered || real_time_chunking().kind != RealTimeChunking::Kind::none);
   if (!fits)
@@ -194,7 +194,7 @@ Result<ActionChunk> Robot::decode(const std::vector<float>& x, const Inputs& inp
   VLA_TRY(chunk.actions, processor_.decode(x, horizon_, d_action_, inputs.raw_state));
   const ChunkShape shape = chunk_shape();
   chunk.horizon = shape.n_row, chunk.d_action = shape.d_normalized;
-  for (int row = 0; row < shape.n_row; ++row)
+  for (int row = processor_.first_row(); row < processor_.first_row() + shape.n_row; ++row)
     chunk.normalized.insert(chunk.normalized.end(), x.begin() + row * d_action_,
                             x.begin() + row * d_action_ + shape.d_normalized);
   chunk.notes = inputs.notes;

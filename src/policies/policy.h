@@ -25,7 +25,7 @@ struct TextLayout {
 /// One observation, as the processor encodes it and the prefix reads it: without absent views, and without padding of
 /// the text unless the recipe adds it.
 struct PrefixInputs {
-  Tensor images;            // [width, height, 3, n_view], in the image recipe's range
+  Tensor images;            // [width, height, 3, n_view], in the image recipe's range; none of a policy without views
   Tensor tokens;            // [n_text] i32; none if the policy reads no instruction
   Tensor state;             // [d_state, 1], normalized and padded; none if policy.d_state is 0
   std::uint64_t views = 0;  // bit i: view i of the bundle is present; 0 if only the number of views matters

@@ -269,7 +269,7 @@ Status Processor::encode_state(const Observation& observation, Inputs& inputs) c
 
 Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int horizon, int d_action,
                                              std::span<const float> raw_state) const {
-  if (d_action != d_action_ || horizon < std::max(1, n_row_) || raw_state.size() != n_state_ ||
+  if (d_action != d_action_ || horizon < std::max(1, first_row_ + n_row_) || raw_state.size() != n_state_ ||
       chunk.size() != static_cast<std::size_t>(horizon) * static_cast<std::size_t>(d_action))
     return Error{Code::internal, "action chunk", fmt::format("({}, {}) and {} states", horizon, d_action_, n_state_),
                  fmt::format("{} numbers in rows of {} and {} states", chunk.size(), d_action, raw_state.size())};
@@ -278,7 +278,7 @@ Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int h
   std::vector<double> row;
   actions.reserve(static_cast<std::size_t>(n_row(horizon)) * width);
   for (int i = 0; i < n_row(horizon); ++i) {
-    const auto numbers = chunk.subspan(static_cast<std::size_t>(i) * static_cast<std::size_t>(d_action),
+    const auto numbers = chunk.subspan(static_cast<std::size_t>(first_row_ + i) * static_cast<std::size_t>(d_action),
                                        static_cast<std::size_t>(d_action));
     row.assign(numbers.begin(), numbers.end());
     for (const auto& op : recipe_.action) op->apply(row, {static_cast<std::size_t>(i), raw_state});

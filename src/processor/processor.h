@@ -68,8 +68,10 @@ class Processor {
   /// Pixels (3, height, width) of a black frame, which some references substitute for an absent view.
   std::vector<float> absent_view() const;
 
-  /// How many rows of a chunk of `horizon` rows are actions: all of them, or the first that the recipe keeps.
+  /// How many rows of a chunk of `horizon` rows are actions: all of them, or those that the recipe keeps, from
+  /// first_row() on.
   int n_row(int horizon) const { return n_row_ > 0 ? n_row_ : horizon; }
+  int first_row() const { return first_row_; }
 
   /// Whether actions are relative to the state of the observation.
   bool relative_actions() const { return relative_actions_; }
@@ -145,7 +147,8 @@ class Processor {
   std::string view_token_text_;
   std::size_t n_state_ = 0;  // values of all states together
   int d_action_ = 0;         // of the network
-  int n_row_ = 0;            // that the recipe keeps; 0: all
+  int first_row_ = 0;
+  int n_row_ = 0;  // that the recipe keeps; 0: all
   bool relative_actions_ = false;
 };
 

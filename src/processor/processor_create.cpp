@@ -96,12 +96,16 @@ Status Processor::read_features(const Bundle& bundle) {
   VLA_TRY(std::vector<std::string> views, keys.strings("observation.views"));
   VLA_TRY(std::vector<std::string> aliases, keys.strings("observation.view_aliases"));
   VLA_TRY(view_optional_, keys.integers("observation.view_optional", kFlag));
-  VLA_TRY(min_views_, keys.integer("observation.min_views", {1, static_cast<double>(views.size())}));
+  VLA_TRY(min_views_,
+          keys.integer("observation.min_views", {views.empty() ? 0.0 : 1.0, static_cast<double>(views.size())}));
   VLA_CHECK(check_names("observation.views", views));
   VLA_CHECK(check_size("observation.view_aliases", aliases, views.size()));
   VLA_CHECK(check_size("observation.view_optional", view_optional_, views.size()));
   if (views.size() > static_cast<std::size_t>(kMaxViews))
     return misfit("observation.views", fmt::format("at most {} views", kMaxViews), std::to_string(views.size()));
+  if (views.empty() != (recipe_.width == 0))
+    return misfit("processor.recipe.image", views.empty() ? "no ops, without views" : "ops of the views",
+                  views.empty() ? "ops" : "none");
   const auto is_missing = [&](const auto& op) { return op->view() >= static_cast<int>(views.size()); };
   if (std::any_of(recipe_.image.begin(), recipe_.image.end(), is_missing) ||
       recipe_.fit->n_view() > static_cast<int>(views.size()))
@@ -215,10 +219,10 @@ Status Processor::bind_state(const Bundle& bundle) {
 
 Status Processor::bind_action(const Bundle& bundle) {
   VLA_TRY(d_action_, bundle.keys().integer("policy.d_action", {1, kMaxVector}));
-  ActionLayout layout{bundle, n_state_, d_action_};
+  ActionLayout layout = {.bundle = bundle, .n_state = n_state_, .width = d_action_};
   for (std::size_t i = 0; i < recipe_.action.size(); ++i)
     VLA_CHECK(recipe_.action[i]->bind(layout, fmt::format("processor.recipe.action[{}]", i)));
-  n_row_ = layout.n_row;
+  first_row_ = layout.first_row, n_row_ = layout.n_row;
   relative_actions_ = layout.relative;
   if (static_cast<std::size_t>(layout.width) == action_names_.size()) return {};
   return misfit("action.names", fmt::format("one name for each of the {} columns that the recipe leaves", layout.width),

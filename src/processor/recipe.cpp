@@ -83,6 +83,18 @@ std::vector<int> Recipe::text_limits() const {
   return all;
 }
 
+namespace {
+
+/// Of a policy without views.
+struct NoImages final : Fit {
+  const char* described() const override { return "none"; }
+  Status apply(const Frame&, int, std::span<float>, const std::string& where) const override {
+    return Error{Code::bad_observation, where, "no image, since the policy reads none", "an image"};
+  }
+};
+
+}  // namespace
+
 Result<Recipe> parse_recipe(const std::string& json) {
   VLA_TRY(const Json document, parse_json(json, kWhere));
   if (!document.is_object()) return Error{Code::bad_bundle, kWhere, "a JSON object", "other text"};
@@ -92,7 +104,10 @@ Result<Recipe> parse_recipe(const std::string& json) {
     if (std::find(kLists.begin(), kLists.end(), item.key()) == kLists.end())
       return Error{Code::bad_bundle, std::string(kWhere) + "." + item.key(), "", "unknown field",
                    "this bundle needs a newer vla"};
-  if (recipe.width == 0)
+  const auto images = document.find("image");
+  if (images != document.end() && images->is_array() && images->empty())
+    recipe.fit = std::make_unique<NoImages>();
+  else if (recipe.width == 0)
     return Error{Code::bad_bundle, std::string(kWhere) + ".image", "a letterbox, a resize or a size", "none"};
   if (recipe.max_tokens == 0 && !recipe.text.empty())
     return Error{Code::bad_bundle, std::string(kWhere) + ".text", "tokenize as the last op", "none"};

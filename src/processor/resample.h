@@ -51,6 +51,7 @@ std::vector<float> resample_torch_cubic(std::vector<float> rgb, int width, int h
 
 /// Float pixels by areas: the mean of every pixel that an output pixel touches, each with the same weight. Source:
 /// torch F.interpolate(mode="area"), aten/src/ATen/native/cpu/AdaptiveAvgPoolKernel.cpp.
+std::vector<float> resample_torch_bilinear(std::vector<float> rgb, int width, int height, int to_width, int to_height);
 std::vector<float> resample_torch_area(std::vector<float> rgb, int width, int height, int to_width, int to_height);
 
 /// Bytes by tf.image.resize with lanczos3 and antialiasing (TensorFlow 2.18): rows first, summed in float32, rounded

@@ -176,6 +176,10 @@ std::vector<float> resample_torch_cubic(std::vector<float> rgb, int width, int h
   return resample(std::move(rgb), width, height, to_width, to_height, kCubic, [](float x) { return x; });
 }
 
+std::vector<float> resample_torch_bilinear(std::vector<float> rgb, int width, int height, int to_width, int to_height) {
+  return resample(std::move(rgb), width, height, to_width, to_height, kTriangle, [](float x) { return x; });
+}
+
 std::vector<float> resample_torch_area(std::vector<float> rgb, int width, int height, int to_width, int to_height) {
   struct Stretch {
     std::int64_t first, end;

@@ -19,6 +19,7 @@ const ResizeFilter kFilters[] = {
     {"smallest_side", "opencv_area", resample_opencv_area},
     {"resize_floats", "bicubic", resample_torch_cubic},
     {"resize_floats", "area", resample_torch_area},
+    {"resize_floats", "bilinear", resample_torch_bilinear},
 };
 
 }  // namespace

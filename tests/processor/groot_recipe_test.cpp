@@ -251,6 +251,26 @@ TEST_CASE("a chunk has the rows that the recipe keeps, and a clip hides nothing"
   EditableBundle bundle = groot();
   bundle.set("policy.horizon", std::int64_t{1});
   CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.action[0].count"));
+  Json recipe = Json::parse(kRecipe);
+  recipe["action"][0] = {{"op", "rows"}, {"first", 1}, {"count", 1}};
+  EditableBundle later = groot();
+  later.set("processor.recipe", recipe.dump());
+  const Processor last = make(later);
+  CHECK(last.first_row() == 1);
+  CHECK(*last.decode(std::vector<float>{NAN, NAN, 9, 9, 5, 5, 9, 9, NAN, NAN, 9, 9}, 3, 4, raw) ==
+        std::vector<float>{3, 0});
+  recipe["action"][0]["first"] = 3;
+  later.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(later), Code::bad_bundle), "1 from row 3 on"));
+}
+
+TEST_CASE("without views the recipe has no ops on images, and with views it has some") {
+  Json recipe = Json::parse(kRecipe);
+  recipe["image"] = Json::array();
+  EditableBundle bundle = groot();
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle),
+                 "processor.recipe.image: expected ops of the views, found none"));
 }
 
 TEST_CASE("an empty instruction becomes what the recipe says, and one of punctuation alone is still refused") {

@@ -96,6 +96,19 @@ TEST_CASE("sizes follow each other, of the last one are the network's images") {
   CHECK_FALSE(recipe->fit->camera_size(0));
 }
 
+TEST_CASE("of a resize in floats the middle is kept") {
+  const ResizeFilter* const bilinear = find_resize_filter("resize_floats", "bilinear");
+  const Frame frame = frame_of(5, 4);
+  const std::vector<float> whole = resized(frame, {{}, {{7, 3, bilinear}}, {}});
+  const FloatResizes cropped = {{}, {{7, 3, bilinear}}, CameraSize{4, 2}};
+  std::vector<float> out(3 * 4 * 2, NAN);
+  REQUIRE(resize_floats(frame, cropped, out, "top").ok());
+  for (std::size_t c = 0; c < 3; ++c)
+    for (std::size_t y = 0; y < 2; ++y)
+      for (std::size_t x = 0; x < 4; ++x)  // of 3 columns 2 are left of it, of 1 row none is above: half to even
+        CHECK(out[(c * 2 + y) * 4 + x] == whole[(c * 3 + y) * 7 + x + 2]);
+}
+
 TEST_CASE("what the document does not say of resize_floats is refused") {
   const auto refused = [](const Json& image) { return refusal(parsed(image), Code::bad_bundle); };
   const Json size = size_op(4, 4, "area"), clip = {{"op", "clip"}, {"low", 0}, {"high", 1}};
@@ -105,6 +118,11 @@ TEST_CASE("what the document does not say of resize_floats is refused") {
   CHECK(contains(refused(Json::array({size, clip, size})), "image[2].op: expected resize_floats as the first ops"));
   CHECK(contains(refused(Json::array({{{"op", "square_pad"}}, size})), "image[1].op"));
   CHECK(contains(refused(Json(5, size)), "image[4].op: expected fewer sizes"));
+  const Json crop = {{"op", "crop_floats"}, {"width", 3}, {"height", 2}};
+  CHECK(contains(refused(Json::array({crop})), "image[0].op: expected crop_floats once, behind resize_floats"));
+  CHECK(contains(refused(Json::array({size, crop, crop})), "image[2].op"));
+  CHECK(contains(refused(Json::array({size, crop, size})), "image[2].op"));
+  CHECK(contains(refused(Json::array({size, {{"op", "crop_floats"}, {"width", 5}, {"height", 2}}})), "image[1].width"));
   Json late = size;
   late.update({{"from_width", 4}, {"from_height", 4}});
   CHECK(contains(refused(Json::array({size, late})), "image[1].from_"));

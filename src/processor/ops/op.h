@@ -22,7 +22,7 @@ namespace vla {
 class JsonFields;
 
 struct Recipe;
-struct Resize;
+struct FloatResizes;
 
 /// A line of the table.
 struct OpEntry {
@@ -48,8 +48,8 @@ class Fit {
   virtual std::optional<CameraSize> camera_size(int /*view*/) const { return {}; }
   /// One more than the last view that the recipe names, 0 where it names none.
   virtual int n_view() const { return 0; }
-  /// The sizes of its resizes in floats, behind which more may follow; null of any other fit.
-  virtual std::vector<Resize>* float_sizes() { return nullptr; }
+  /// Its resizes in floats, behind which more may follow; null of any other fit.
+  virtual FloatResizes* float_resizes() { return nullptr; }
   /// What it computes beside making the planes, for a frame of this size, in pixels of about 10 ns.
   virtual std::int64_t work(int /*width*/, int /*height*/) const { return 0; }
   /// Writes (3, height, width) float32 in [0, 1] for this view. Errors: bad_observation, at `where`.
@@ -127,7 +127,8 @@ class StateOp {
 struct ActionLayout {
   const Bundle& bundle;
   std::size_t n_state;
-  int width;                        // columns
+  int width;  // columns
+  int first_row = 0;
   int n_row = 0;                    // rows, 0: all
   bool relative = false;            // to the state
   std::set<int> unnormalized = {};  // columns

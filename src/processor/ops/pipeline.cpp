@@ -50,9 +50,6 @@ Size size_after(const Op& op, const Size&) {
   return {static_cast<double>(op.width), static_cast<double>(op.height)};
 }
 
-/// As Python rounds a half.
-int half_to_even(int whole) { return whole / 2 + (whole % 4 == 3 ? 1 : 0); }
-
 Image cropped(const Image& from, const CenterCrop& op) {
   Image to{op.width, op.height, {}};
   const int left = half_to_even(from.width - op.width), top = half_to_even(from.height - op.height);

@@ -34,6 +34,9 @@ struct ExpectSize {
   int height = 0;
 };
 
+/// Half of a whole number, as Python rounds it.
+constexpr int half_to_even(int whole) { return whole / 2 + (whole % 4 == 3 ? 1 : 0); }
+
 /// The middle of an image, no larger than it; of an odd rest that is cut off the half is rounded to even.
 struct CenterCrop {
   int width = 0;

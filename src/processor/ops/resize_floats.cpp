@@ -32,9 +32,15 @@ Status resize_floats(const Frame& frame, const FloatResizes& to, std::span<float
     width = size.width;
     height = size.height;
   }
-  const std::size_t n_pixel = pixels.size() / 3;
-  for (std::size_t i = 0; i < n_pixel; ++i)
-    for (std::size_t c = 0; c < 3; ++c) out[c * n_pixel + i] = pixels[3 * i + c];
+  const CameraSize kept = to.crop.value_or(CameraSize{width, height});
+  const int left = half_to_even(width - kept.width), top = half_to_even(height - kept.height);
+  std::size_t at = 0;
+  for (std::size_t c = 0; c < 3; ++c)
+    for (int y = top; y < top + kept.height; ++y)
+      for (int x = left; x < left + kept.width; ++x)
+        out[at++] =
+            pixels[3 * (static_cast<std::size_t>(y) * static_cast<std::size_t>(width) + static_cast<std::size_t>(x)) +
+                   c];
   return {};
 }
 
@@ -46,7 +52,7 @@ constexpr std::size_t kMaxSizes = 4;
 struct FloatFit final : OneFit<FloatResizes> {
   FloatFit() : OneFit("resized", resize_floats) {}
   std::optional<CameraSize> camera_size(int /*view*/) const override { return op.camera; }
-  std::vector<Resize>* float_sizes() override { return &op.sizes; }
+  FloatResizes* float_resizes() override { return &op; }
 };
 
 Result<Resize> read_size(JsonFields& fields) {
@@ -58,9 +64,10 @@ Result<Resize> read_size(JsonFields& fields) {
 
 /// Several in a row are one fit. The first may name the only frame size that is accepted.
 Status parse(JsonFields& fields, Recipe& recipe) {
-  std::vector<Resize>* sizes = recipe.fit != nullptr ? recipe.fit->float_sizes() : nullptr;
-  if ((recipe.fit != nullptr && sizes == nullptr) || !recipe.image.empty())
+  FloatResizes* const before = recipe.fit != nullptr ? recipe.fit->float_resizes() : nullptr;
+  if ((recipe.fit != nullptr && before == nullptr) || !recipe.image.empty() || (before != nullptr && before->crop))
     return misplaced(fields, "resize_floats as the first ops on images");
+  std::vector<Resize>* sizes = before != nullptr ? &before->sizes : nullptr;
   if (sizes != nullptr && sizes->size() == kMaxSizes) return misplaced(fields, "fewer sizes");
   VLA_TRY(const Resize size, read_size(fields));
   if (sizes == nullptr) {
@@ -80,8 +87,22 @@ Status parse(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
+/// Crops the middle of what was resized.
+Status parse_crop(JsonFields& fields, Recipe& recipe) {
+  FloatResizes* const before = recipe.fit != nullptr ? recipe.fit->float_resizes() : nullptr;
+  if (before == nullptr || before->crop || !recipe.image.empty())
+    return misplaced(fields, "crop_floats once, behind resize_floats");
+  CameraSize size;
+  VLA_TRY(size.width, fields.integer("width", 1, recipe.width));
+  VLA_TRY(size.height, fields.integer("height", 1, recipe.height));
+  before->crop = size;
+  recipe.width = size.width;
+  recipe.height = size.height;
+  return {};
+}
+
 }  // namespace
 
-Ops resize_floats_ops() { return {{"image", "resize_floats", parse}}; }
+Ops resize_floats_ops() { return {{"image", "resize_floats", parse}, {"image", "crop_floats", parse_crop}}; }
 
 }  // namespace vla

@@ -18,11 +18,13 @@ namespace vla {
 struct FloatResizes {
   std::optional<CameraSize> camera;  // the only frame size accepted, if it determines the images' size
   std::vector<Resize> sizes;
+  std::optional<CameraSize> crop;  // out of the middle of the last size; half of an odd rest is rounded to even
 };
 
 /// Writes (3, height, width) float32 to `out`; bytes are divided by 255 first. Bicubic edges may leave [0, 1]. A step
 /// to the image's own size does nothing. Source: lerobot policies/vla_jepa/modeling_vla_jepa.py
-/// (VLAJEPAModel.predict_action); transformers models/qwen2_vl/image_processing_qwen2_vl.py, for float tensors. Errors:
+/// (VLAJEPAModel.predict_action); transformers models/qwen2_vl/image_processing_qwen2_vl.py, for float tensors;
+/// torchvision transforms/functional.py center_crop. Errors:
 /// bad_observation.
 Status resize_floats(const Frame& frame, const FloatResizes& to, std::span<float> out, const std::string& where);
 

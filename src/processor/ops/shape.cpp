@@ -110,15 +110,15 @@ Status parse_take(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// Keeps the first rows of a chunk, which the robot executes.
+/// Keeps some rows of a chunk, which the robot executes: the first, or those behind rows of the past.
 struct RowsOp final : ActionOp {
-  int count = 0;
+  int first = 0, count = 0;
   Status bind(ActionLayout& layout, const std::string& where) override {
     VLA_TRY(const int horizon, layout.bundle.keys().integer("policy.horizon", kAnySize));
-    if (count > horizon)
+    if (first + count > horizon)
       return misfit(where + ".count", fmt::format("at most the {} rows of a chunk (policy.horizon)", horizon),
-                    std::to_string(count));
-    layout.n_row = count;
+                    fmt::format("{} from row {} on", count, first));
+    layout.first_row = first, layout.n_row = count;
     return {};
   }
   void apply(std::vector<double>&, const RowPlace&) const override {}
@@ -128,6 +128,9 @@ Status parse_rows(JsonFields& fields, Recipe& recipe) {
   if (!recipe.action.empty()) return misplaced(fields, "rows as the first op");
   auto op = std::make_unique<RowsOp>();
   VLA_TRY(op->count, fields.integer("count", 1, kMaxVector));
+  if (fields.has("first")) {
+    VLA_TRY(op->first, fields.integer("first", 0, kMaxVector));
+  }
   recipe.action.push_back(std::move(op));
   return {};
 }
