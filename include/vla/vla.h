@@ -158,7 +158,8 @@ struct vla_description {
   const char* device;    /* "cpu, 8 threads", "vulkan:0, " and the name that its driver gives it */
   uint64_t memory_weights, memory_plan, memory_working; /* bytes */
 
-  size_t noise_rows; /* `horizon`, or more where the robot gets the first rows only of what the network computes */
+  size_t noise_rows; /* `horizon`, or more where the robot gets some rows only of what the network computes, or where
+                        steps of the solver draw: the start's rows, then as many of each such step */
   const char* real_time_chunking; /* what the leftover of an observation does: "guided", "inpainted", or empty where
                                      there must be none */
   const char* embodiment;         /* tag of the robot; empty where the bundle is for one, which it does not name */
@@ -210,7 +211,7 @@ typedef struct vla_observation {
   const char* text;   /* the instruction, UTF-8, which may be empty; a NUL at the end is not needed and not counted.
                          NULL: none is given, as for a policy that reads none, with max_text_tokens 0 */
   size_t text_size;   /* bytes */
-  const float* noise; /* the solver's start, (noise_rows, d_noise) row by row, or NULL */
+  const float* noise; /* what the solver draws, (noise_rows, d_noise) row by row, or NULL */
   size_t n_noise;     /* noise_rows * d_noise */
   uint32_t has_seed;  /* 1: the noise is drawn from `seed`, the same bytes on every machine */
   uint64_t seed;

@@ -60,7 +60,8 @@ class Spec:
     horizon       rows of a chunk
     d_action      columns of a chunk
     d_noise       columns of the noise
-    noise_rows    its rows: `horizon`, or more where the robot gets the first rows only of what the network computes
+    noise_rows    its rows: `horizon`, or more where the robot gets some rows only of what the network computes, or where steps of
+                  the solver draw too: then the start comes first, and behind it as many rows for each of these steps
     noise         its distribution, e.g. "normal"
     real_time_chunking  what a Leftover does: "guided", "inpainted", or "" where it is refused
     embodiment    tag of the robot, where the bundle is for several; else ""

@@ -26,7 +26,7 @@ PROTOCOL_VERSION = 1
 DESCRIPTOR = Path(__file__).with_name("vla.desc")
 MAX_PARTS = 1 << 16  # messages and texts of one answer
 MAX_NOISE = 1 << 22  # numbers of one act's noise
-_MOST = {"horizon": 1 << 16, "n_action_steps": 1 << 16, "noise_rows": 1 << 16, "d_noise": 1 << 16, "rate_hz": 1e6}  # numbers of a description
+_MOST = {"horizon": 1 << 16, "n_action_steps": 1 << 16, "noise_rows": 1 << 22, "d_noise": 1 << 16, "rate_hz": 1e6}  # numbers of a description
 
 
 def _load_messages() -> Dict[str, Any]:

@@ -60,7 +60,7 @@ void Description::fill_robot(const vla::Description& from) {
   d.horizon = size_of(from.horizon), d.d_action = from.actions.size();
   d.action_names = keep_names(from.actions), d.action_units = keep_units(from.actions);
   d.rate_hz = from.rate_hz, d.n_action_steps = size_of(from.n_action_steps);
-  d.noise_rows = size_of(from.solver_horizon), d.d_noise = size_of(from.d_action_padded);
+  d.noise_rows = size_of(from.noise_rows), d.d_noise = size_of(from.d_action_padded);
   d.noise = keep(from.noise), d.real_time_chunking = keep(from.real_time_chunking);
   d.embodiment = keep(from.embodiment);
 }

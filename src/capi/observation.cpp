@@ -98,10 +98,10 @@ Result<Noise> read_noise(const vla_observation& given, const Robot& robot) {
     if (given.n_noise != 0) return usage("observation.noise", fmt::format("{} numbers", given.n_noise), "NULL");
     return Noise(given.seed);
   }
-  const auto horizon = static_cast<std::size_t>(robot.solver_horizon()),
+  const auto n_row = static_cast<std::size_t>(robot.noise_rows()),
              width = static_cast<std::size_t>(robot.d_action_padded());
-  if (given.n_noise != horizon * width)
-    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon, width),
+  if (given.n_noise != n_row * width)
+    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", n_row, width),
                  fmt::format("{} numbers", given.n_noise)};
   return Noise(std::vector<float>(given.noise, given.noise + given.n_noise));
 }

@@ -100,7 +100,7 @@ Result<NpyArray> read_rows(const std::string& file, const std::string& where) {
 Result<Noise> read_noise(const RunOptions& options, const Robot& robot) {
   if (options.noise.empty()) return Noise(*options.seed);
   VLA_TRY(NpyArray array, read_rows(options.noise, "noise"));
-  const std::vector<std::size_t> shape = {static_cast<std::size_t>(robot.solver_horizon()),
+  const std::vector<std::size_t> shape = {static_cast<std::size_t>(robot.noise_rows()),
                                           static_cast<std::size_t>(robot.d_action_padded())};
   if (array.shape != shape)
     return Error{Code::bad_observation, "noise", fmt::format("shape ({})", fmt::join(shape, ", ")),

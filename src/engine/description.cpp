@@ -56,7 +56,7 @@ Description describe(const Engine& engine, const Robot& robot) {
   if (keys.has(kRtcHorizon))
     out.rtc = {*keys.integer(kRtcHorizon, {1, kMaxVector}), *keys.string(kRtcSchedule),
                *keys.number(kRtcGuidance, {0, 1e9})};
-  out.solver_horizon = robot.solver_horizon();
+  out.noise_rows = robot.noise_rows();
   out.d_action_padded = robot.d_action_padded();
   out.solver = *keys.string("solver.kind");
   out.noise = robot.solver().noise;

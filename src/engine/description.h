@@ -32,10 +32,11 @@ struct Description {
 
   int horizon;  // rows of a chunk
   std::vector<Number> actions;
-  double rate_hz;                       // rows per second, 0 if the bundle does not state it
-  int n_action_steps;                   // rows that the checkpoint executes before it looks again; 0 if unstated
-  int solver_horizon, d_action_padded;  // rows and columns of the solver's start; a chunk has the first of them
-  std::string solver, noise;            // kinds
+  double rate_hz;      // rows per second, 0 if the bundle does not state it
+  int n_action_steps;  // rows that the checkpoint executes before it looks again; 0 if unstated
+  int noise_rows,
+      d_action_padded;        // rows and columns of the noise: the solver's start, then that of each step that draws
+  std::string solver, noise;  // kinds
   int n_step;
   double t_start;
   /// The checkpoint's settings of real-time chunking; a horizon of 0 if it states none.

@@ -29,7 +29,7 @@ void set_inputs(Plan& plan, const EncodedObservation& observation) {
   const Inputs& in = observation.inputs;
   const std::optional<Steering>& steering = observation.steering;
   plan.set_inputs(in.pixels, observation.pixels_ahead.get(), in.tokens, in.state);
-  plan.set_x(steering ? steering->start : observation.x);
+  plan.set_noise(steering ? steering->start : observation.noise);
   if (steering) plan.set_steering(*steering);
 }
 

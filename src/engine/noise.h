@@ -11,7 +11,8 @@
 
 namespace vla {
 
-/// The solver's start: the values themselves, (horizon, d_action) in rows, or a seed to draw them from.
+/// The solver's start, and what it draws for steps: the values themselves, (noise_rows, d_action), or a seed to draw
+/// them from.
 using Noise = std::variant<std::vector<float>, std::uint64_t>;
 
 /// Draws `count` values of `kind` ("normal": mean 0, deviation 1; "uniform": [-1, 1)). The same seed gives the same

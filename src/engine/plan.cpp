@@ -4,8 +4,6 @@
 
 #include <fmt/format.h>
 
-#include <numeric>
-
 #include "nn/tokens.h"
 
 namespace vla {
@@ -30,16 +28,6 @@ TapFilter step_filter(const std::string& pattern, int n_step) {
   };
 }
 
-/// The k of the next step. The device counts, so nothing is uploaded between steps.
-Tensor after(Graph& g, Tensor k, int n_step) {
-  const Tensor table = g.constant_ids("next step", [n_step] {
-    std::vector<std::int32_t> next(static_cast<std::size_t>(n_step));
-    std::iota(next.begin(), next.end() - 1, 1);  // after the last step
-    return next;
-  });
-  return column(g, g.add(op::Reshape{}, {table}, {1, n_step, 1, 1}), k);
-}
-
 }  // namespace
 
 Plan::Plan(const Network& network, const InputShape& shape, const PlanContext& context)
@@ -50,7 +38,8 @@ Plan::Plan(const Network& network, const InputShape& shape, const PlanContext& c
       state_(shape.d_state > 0 ? slots_.add_f32({shape.d_state, 1, 1, 1}) : nullptr),
       x_(slots_.add_f32({network.d_action, network.horizon, 1, 1})),
       k_(slots_.add_i32({1, 1, 1, 1})),
-      start_(network.solver.renoises ? slots_.add_f32(x_->shape) : nullptr),
+      noise_(network.solver.rereads_noise() ? slots_.add_f32({count(x_->shape), network.solver.n_noise(), 1, 1})
+                                            : nullptr),
       target_(shape.steered ? slots_.add_f32(x_->shape) : nullptr),
       keep_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
       pull_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
@@ -89,9 +78,10 @@ Status Plan::lower(const Network& network, const PlanContext& context) {
     answer = steered(step, x, k, answer);
     changing.varying.insert(changing.varying.end(), {target_, keep_, pull_});
   }
-  const Tensor start = start_ != nullptr ? step.input(start_) : Tensor();
-  step.write(step.name("x", network.solver.next(step, x, answer, start, k)), x_);
-  if (condition || target_ != nullptr || start_ != nullptr) step.write(after(step, k, network.solver.n_step), k_);
+  const Tensor noise = noise_ != nullptr ? step.input(noise_) : Tensor();
+  step.write(step.name("x", network.solver.next(step, x, answer, noise, k)), x_);
+  // The device counts, so nothing is uploaded between steps.
+  if (condition || target_ != nullptr || network.solver.counts()) step.write(network.solver.after(step, k), k_);
 
   if (context.see_graph)
     for (const Graph* graph : {&prefix, &step}) context.see_graph(*graph);
@@ -123,11 +113,12 @@ void Plan::set_inputs(std::span<const float> pixels, const Device::Sent* ahead, 
   if (state_ != nullptr) device_.set(*state_, state.data(), state.size_bytes());
 }
 
-void Plan::set_x(std::span<const float> x) {
+void Plan::set_noise(std::span<const float> noise) {
   constexpr std::int32_t kFirst = 0;
-  device_.set(*x_, x.data(), x.size_bytes());
+  const std::span<const float> start = noise.first(static_cast<std::size_t>(count(x_->shape)));
+  device_.set(*x_, start.data(), start.size_bytes());
   device_.set(*k_, &kFirst, sizeof(kFirst));
-  if (start_ != nullptr) device_.set(*start_, x.data(), x.size_bytes());
+  if (noise_ != nullptr) device_.set(*noise_, noise.data(), noise.size_bytes());
 }
 
 void Plan::set_steering(const Steering& steering) {

@@ -50,8 +50,8 @@ class Plan {
   /// `ahead`: pixels that were sent to the device before, or null.
   void set_inputs(std::span<const float> pixels, const Device::Sent* ahead, std::span<const std::int32_t> tokens,
                   std::span<const float> state);
-  /// Sets the start of the first step.
-  void set_x(std::span<const float> x);
+  /// Sets the start of the first step, and what is drawn for steps behind it.
+  void set_noise(std::span<const float> noise);
   std::vector<float> x() const { return device_.get(*x_); }
   /// Sets the steering, for a shape with a leftover.
   void set_steering(const Steering& steering);
@@ -90,9 +90,9 @@ class Plan {
   Device& device_;
   Slots slots_;
   // The inputs of an act, side by side in the order in which the act sets them, so that one upload sends them all.
-  // Tokens and state may be null. `start` is null unless the solver renoises; the last three are null without a
+  // Images, tokens and state may be null. `noise` is null unless steps read it; the last three are null without a
   // leftover.
-  Slot *images_, *tokens_, *state_, *x_, *k_, *start_, *target_, *keep_, *pull_;
+  Slot *images_, *tokens_, *state_, *x_, *k_, *noise_, *target_, *keep_, *pull_;
   std::uint64_t views_;
   TextLayout text_;
   Cache cache_;

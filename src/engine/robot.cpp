@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <cmath>
 
 namespace vla {
@@ -129,9 +130,9 @@ Status Robot::encode(const Observation& observation, const Noise& noise, const s
   VLA_CHECK(processor_.encode_state(observation, to.inputs));
   clock.lap(to.timing, "preprocess");
   VLA_CHECK(processor_.encode_text(observation, to.inputs));
-  VLA_TRY(to.x, start(noise));
+  VLA_TRY(to.noise, values_of(noise));
   if (leftover) {
-    VLA_TRY(to.steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(to.x)));
+    VLA_TRY(to.steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(to.noise)));
     VLA_CHECK(check_leftover(observation, *leftover, to.inputs));
   }
   clock.lap(to.timing, "tokenize");
@@ -157,20 +158,20 @@ Result<EncodedObservation> Robot::zeros(const InputShape& shape) const {
   to.inputs.n_view = shape.n_view, to.inputs.views = shape.views;
   to.inputs.pixels.resize(size(std::int64_t{3} * shape.width * shape.height * shape.n_view));
   to.inputs.tokens.resize(size(shape.n_text)), to.inputs.state.resize(size(shape.d_state));
-  to.x.resize(size(std::int64_t{horizon_} * d_action_));
+  to.noise.resize(size(std::int64_t{noise_rows()} * d_action_));
   if (shape.steered) {
     const std::vector<float> rates(size(std::int64_t{solver_.n_step} * horizon_));
-    to.steering = Steering{to.x, to.x, rates, rates};
+    to.steering = Steering{to.noise, to.noise, rates, rates};
   }
   return to;
 }
 
-Result<std::vector<float>> Robot::start(const Noise& noise) const {
-  const std::size_t count = static_cast<std::size_t>(horizon_) * static_cast<std::size_t>(d_action_);
+Result<std::vector<float>> Robot::values_of(const Noise& noise) const {
+  const std::size_t count = static_cast<std::size_t>(noise_rows()) * static_cast<std::size_t>(d_action_);
   if (const auto* seed = std::get_if<std::uint64_t>(&noise)) return draw_noise(solver_.noise, *seed, count);
   const auto& values = std::get<std::vector<float>>(noise);
   if (values.size() != count)
-    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon_, d_action_),
+    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", noise_rows(), d_action_),
                  fmt::format("{} numbers", values.size())};
   for (float value : values)
     if (!std::isfinite(value)) return Error{Code::bad_observation, "noise", "finite numbers", fmt::format("{}", value)};

@@ -30,7 +30,7 @@ struct ActShape {
 struct EncodedObservation {
   const Robot* robot = nullptr;  // the robot that the observation names
   Inputs inputs;
-  std::vector<float> x;  // what the solver starts from
+  std::vector<float> noise;  // what the solver starts from, and what it draws for steps
   std::optional<Steering> steering;
   Timing timing;
   std::unique_ptr<Device::Sent> pixels_ahead;  // if the pixels are on their way to the device already
@@ -85,8 +85,10 @@ class Robot {
   RealTimeChunking real_time_chunking() const;
   /// Rows of a chunk.
   int horizon() const { return processor_.n_row(horizon_); }
-  /// Rows and columns of the solver's start: those of a chunk, or more.
+  /// Rows and columns of the network's chunk: those of the robot's, or more.
   int solver_horizon() const { return horizon_; }
+  /// Rows of the noise, as wide as the network's chunk: the solver's start, then as many for each step that draws.
+  int noise_rows() const { return horizon_ * solver_.n_noise(); }
   int d_action_padded() const { return d_action_; }
   /// Bytes that were computed at load.
   std::size_t constants_size() const { return tables_.size() + constant_slots_.size(); }
@@ -98,7 +100,7 @@ class Robot {
   Status check_leftover(const Observation& observation, const Leftover& leftover, Inputs& inputs) const;
   ChunkShape chunk_shape() const;
   std::uint64_t view_key(std::uint64_t views) const;
-  Result<std::vector<float>> start(const Noise& noise) const;
+  Result<std::vector<float>> values_of(const Noise& noise) const;
   std::vector<float> normalized(const std::vector<float>& x) const;
 
   Bundle bundle_;

@@ -2,6 +2,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "engine/solver.h"
 
+#include <algorithm>
+#include <numeric>
+
 #include "nn/tokens.h"
 
 namespace vla {
@@ -12,13 +15,22 @@ Status expect(bool holds, const char* key, const char* expected, const std::stri
   return Error{Code::bad_bundle, key, expected, found, "this bundle needs a newer vla, or was not made by vla-convert"};
 }
 
+/// min(max(x, -limit), limit).
+Tensor clipped(Graph& g, Tensor x, float limit) {
+  const Tensor most = full(g, limit, 1, 1), least = full(g, -limit, 1, 1);
+  const Tensor above = add(g, activate(g, add(g, x, most), Activation::relu), least);
+  const Tensor room = activate(g, add(g, scale(g, above, -1), most), Activation::relu);
+  return add(g, scale(g, room, -1), most);
+}
+
 }  // namespace
 
 Result<Solver> Solver::read(const Keys& keys) {
   Solver solver;
   VLA_TRY(const std::string kind, keys.string("solver.kind"));
-  VLA_CHECK(expect(kind == "euler" || kind == "euler_float32" || kind == "direct" || kind == "renoise", "solver.kind",
-                   "euler, euler_float32, direct or renoise", kind));
+  const bool denoises = kind == "ddpm" || kind == "ddim";
+  VLA_CHECK(expect(denoises || kind == "euler" || kind == "euler_float32" || kind == "direct" || kind == "renoise",
+                   "solver.kind", "euler, euler_float32, direct, renoise, ddpm or ddim", kind));
   solver.direct = kind == "direct", solver.renoises = kind == "renoise";
   VLA_TRY(solver.n_step, keys.integer("solver.steps", {1, solver.direct ? 1.0 : 1000.0}));
   VLA_TRY(solver.noise, keys.string("solver.noise"));
@@ -29,6 +41,12 @@ Result<Solver> Solver::read(const Keys& keys) {
   }
   VLA_CHECK(
       expect(solver.noise == "normal" || solver.noise == "uniform", "solver.noise", "normal or uniform", solver.noise));
+  if (denoises) {
+    VLA_TRY(solver.diffusion, DiffusionSchedule::read(keys, kind == "ddpm", solver.n_step));
+    for (const DiffusionSchedule::Step& step : solver.diffusion->steps)
+      solver.times.push_back({static_cast<float>(step.time), static_cast<double>(step.time)});
+    return solver;
+  }
   if (solver.renoises) {
     for (int k = solver.n_step; k > 0; --k) {
       const double time = static_cast<double>(k) / solver.n_step;
@@ -48,9 +66,40 @@ Result<Solver> Solver::read(const Keys& keys) {
   return solver;
 }
 
-Tensor Solver::next(Graph& g, Tensor x, Tensor answer, Tensor start, Tensor k) const {
-  if (renoises) return blend(g, answer, start, k);
+Tensor Solver::next(Graph& g, Tensor x, Tensor answer, Tensor noise, Tensor k) const {
+  if (diffusion) return denoised(g, x, answer, noise, k);
+  if (renoises) return blend(g, answer, reshape(g, noise, x.shape()), k);
   return direct ? answer : add(g, x, scale(g, answer, dt));
+}
+
+Tensor Solver::after(Graph& g, Tensor k) const {
+  const Tensor table = g.constant_ids("next step", [n = n_step] {
+    std::vector<std::int32_t> next(static_cast<std::size_t>(n));
+    std::iota(next.begin(), next.end() - 1, 1);  // 0 after the last step
+    return next;
+  });
+  return column(g, g.add(op::Reshape{}, {table}, {1, n_step, 1, 1}), k);
+}
+
+/// The noise of step k is the one after the start's and those of steps before; after the last step it counts for
+/// nothing.
+Tensor Solver::denoised(Graph& g, Tensor x, Tensor answer, Tensor noise, Tensor k) const {
+  using Step = DiffusionSchedule::Step;
+  const auto& steps = diffusion->steps;
+  const auto factor = [&](float Step::*number) {
+    std::vector<float> values;
+    for (const Step& step : steps) values.push_back(step.*number);
+    return column(g, g.constant(values, {1, n_step, 1, 1}), k);
+  };
+  const Tensor other = multiply(g, add(g, x, scale(g, multiply(g, answer, factor(&Step::p)), -1)), factor(&Step::q));
+  Tensor sample = diffusion->predicts_noise ? other : answer;
+  if (diffusion->clip > 0) sample = clipped(g, sample, diffusion->clip);
+  const Tensor predicted_noise = diffusion->predicts_noise ? answer : other;
+  const Tensor rest = diffusion->draws ? x : predicted_noise;
+  Tensor next = add(g, multiply(g, sample, factor(&Step::of_sample)), multiply(g, rest, factor(&Step::of_rest)));
+  if (n_noise() == 1) return next;
+  const Tensor drawn = reshape(g, column(g, noise, after(g, k)), x.shape());
+  return add(g, next, multiply(g, drawn, factor(&Step::of_drawn)));
 }
 
 /// The time of the step after step k; 0 after the last.

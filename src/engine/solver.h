@@ -2,10 +2,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <optional>
 #include <string>
 #include <vector>
 
 #include "bundle/keys.h"
+#include "engine/diffusion_schedule.h"
 #include "graph/graph.h"
 #include "modules/timestep_embedding.h"
 
@@ -14,6 +16,9 @@ namespace vla {
 /// The solver as data: the times at which the action head is evaluated, and the update rule.
 ///   euler, euler_float32  x <- x + dt * velocity(x, t_k), with equal steps from t_start to t_end
 ///   direct                one pass: x <- what the network gives, from a start of zeros
+///   ddpm, ddim            as the scheduler of this name (engine/diffusion_schedule.h); ddpm draws numbers for every
+///   step
+///                         but the last
 ///   renoise               the network gives actions: x <- t * start + (1 - t) * actions, where t is the next step's
 ///                         time, from 1 to 0 (lerobot policies/xvla/modeling_xvla.py generate_actions)
 struct Solver {
@@ -25,18 +30,29 @@ struct Solver {
   /// dt added k times in float32, as in openpi. They differ by 1e-7, which changes a sine with a period of 4e-3 by one
   /// part in 1e4.
   std::vector<SolverTime> times;
-  std::string noise;  // kind of the start: normal, uniform or none
+  std::string noise;  // kind of the start, and of what is drawn for steps: normal, uniform or none
+  std::optional<DiffusionSchedule> diffusion;
+
+  /// How many chunks of noise an act has: the start, then one for each step that draws.
+  int n_noise() const { return diffusion && diffusion->draws ? n_step : 1; }
+  /// Whether steps differ by their number.
+  bool counts() const { return renoises || diffusion.has_value(); }
+  /// Whether steps read the act's noise.
+  bool rereads_noise() const { return renoises || n_noise() > 1; }
 
   /// Reads `solver.*`. Errors: bad_bundle. Source: lerobot policies/common/flow_matching.py euler_integrate, openpi
   /// models_pytorch/pi0_pytorch.py sample_actions.
   static Result<Solver> read(const Keys& keys);
 
-  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x. For a solver that renoises,
-  /// `start` is the first x and `k` [1] i32 the step.
-  Tensor next(Graph& g, Tensor x, Tensor answer, Tensor start = {}, Tensor k = {}) const;
+  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x. `noise` is the act's,
+  /// [d_action * horizon, n_noise], for a solver that reads it again, and `k` [1] i32 the step, for all but Euler's.
+  Tensor next(Graph& g, Tensor x, Tensor answer, Tensor noise = {}, Tensor k = {}) const;
+  /// The step after step k [1] i32, and 0 after the last.
+  Tensor after(Graph& g, Tensor k) const;
 
  private:
   Tensor blend(Graph& g, Tensor answer, Tensor start, Tensor k) const;
+  Tensor denoised(Graph& g, Tensor x, Tensor answer, Tensor noise, Tensor k) const;
 };
 
 }  // namespace vla

@@ -24,6 +24,7 @@ ActLimits act_limits(const ServerOptions& options, const Robot& robot) {
           .max_text = options.max_text,
           .max_views = processor.views().names().size(),
           .horizon = robot.solver_horizon(),
+          .noise_rows = robot.noise_rows(),
           .d_noise = robot.d_action_padded(),
           .d_action = static_cast<int>(processor.action_names().size()),
           .fit = processor.recipe().fit.get()};

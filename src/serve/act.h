@@ -16,9 +16,10 @@ struct ActLimits {
   std::int64_t max_pixels = 0;  // cost of all images: decoding and fitting
   std::size_t max_text = 0;     // bytes
   std::size_t max_views = 0;
-  int horizon = 0, d_noise = 0;  // size of the policy's noise
-  int d_action = 0;              // of a chunk
-  const Fit* fit = nullptr;      // the recipe's image ops
+  int horizon = 0;  // of the network's chunk
+  int noise_rows = 0, d_noise = 0;
+  int d_action = 0;          // of a chunk
+  const Fit* fit = nullptr;  // the recipe's image ops
 };
 
 /// An act, decoded for the engine.

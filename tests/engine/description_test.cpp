@@ -31,7 +31,7 @@ TEST_CASE("a robot that gets the first rows and columns only: the chunk is small
   const auto engine = load_engine(golden_path("gr00t_n1_7/libero/bundle.gguf"));
   const Description d = describe(*engine, engine->robot());
   CHECK(d.horizon == 5);
-  CHECK(d.solver_horizon == 8);
+  CHECK(d.noise_rows == 8);
   CHECK(d.actions.size() == 7);
   CHECK(d.d_action_padded == 11);
   CHECK(d.states.size() == 7);

@@ -61,7 +61,7 @@ inline ActionChunk small_chunk() {
 }
 
 inline constexpr serve::ActLimits kMessageLimits{
-    .max_pixels = 1 << 12, .max_text = 100, .max_views = 4, .horizon = 2, .d_noise = 3, .d_action = 3};
+    .max_pixels = 1 << 12, .max_text = 100, .max_views = 4, .horizon = 2, .noise_rows = 2, .d_noise = 3, .d_action = 3};
 
 /// Reads bytes as openpi's front end does. Whether they were an act.
 inline bool check_openpi(std::span<const std::byte> bytes) {

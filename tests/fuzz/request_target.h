@@ -21,8 +21,13 @@ struct RequestFate {
 /// message of bounded length. Aborts when it is not so.
 inline RequestFate check_request(std::span<const std::byte> bytes) {
   // Small, so that the time goes into the decoders.
-  constexpr serve::ActLimits kLimits{
-      .max_pixels = 1 << 16, .max_text = 100, .max_views = 4, .horizon = 3, .d_noise = 5, .d_action = 2};
+  constexpr serve::ActLimits kLimits{.max_pixels = 1 << 16,
+                                     .max_text = 100,
+                                     .max_views = 4,
+                                     .horizon = 3,
+                                     .noise_rows = 3,
+                                     .d_noise = 5,
+                                     .d_action = 2};
   const auto refuse = [](const Error& error) {
     if (error.message().size() > 4096) std::abort();
     if (error.code != Code::bad_request && error.code != Code::incompatible && error.code != Code::too_large &&

@@ -17,7 +17,7 @@ using namespace vla::wire;
 namespace {
 
 const ActLimits kLimits = {
-    .max_pixels = 10'000, .max_text = 40, .max_views = 5, .horizon = 2, .d_noise = 3, .d_action = 2};
+    .max_pixels = 10'000, .max_text = 40, .max_views = 5, .horizon = 2, .noise_rows = 2, .d_noise = 3, .d_action = 2};
 const FeatureNames kViews("view", {"observation.images.png"}, {""}), kStates("state", {"robot.arm"}, {""});
 
 /// Every field of the schema, one alternative of each choice.

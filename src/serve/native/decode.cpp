@@ -191,9 +191,10 @@ Status decode_start(const v1::Act& act, const ActLimits& limits, ActRequest& req
     return {};
   }
   const v1::Noise& noise = act.noise();
-  const auto horizon = static_cast<std::uint32_t>(limits.horizon), d_noise = static_cast<std::uint32_t>(limits.d_noise);
-  if (noise.horizon() != horizon || noise.d_action() != d_noise)
-    return bad_observation("noise", fmt::format("{} rows of {}", horizon, d_noise),
+  const auto n_row = static_cast<std::uint32_t>(limits.noise_rows),
+             d_noise = static_cast<std::uint32_t>(limits.d_noise);
+  if (noise.horizon() != n_row || noise.d_action() != d_noise)
+    return bad_observation("noise", fmt::format("{} rows of {}", n_row, d_noise),
                            fmt::format("{} rows of {}", noise.horizon(), noise.d_action()));
   request.noise = std::vector<float>(noise.values().begin(), noise.values().end());  // the engine checks its numbers
   return {};

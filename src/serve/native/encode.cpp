@@ -75,7 +75,7 @@ void write_robot(const Description& d, v1::Description& out) {
     out.mutable_rtc()->set_max_guidance(d.rtc.max_guidance);
   }
   out.set_d_noise(u32(d.d_action_padded));
-  out.set_noise_rows(u32(d.solver_horizon));
+  out.set_noise_rows(u32(d.noise_rows));
   out.set_noise_kind(d.noise);
   out.set_real_time_chunking(d.real_time_chunking);
   out.set_embodiment(d.embodiment);
