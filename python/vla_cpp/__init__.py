@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .chunk import Chunk as Chunk
     from .client import Client as Client
     from .errors import *  # noqa: F403
+    from .history import History as History
     from .observation import Leftover as Leftover
     from .openpi import OpenpiClient as OpenpiClient
     from .policy import Policy as Policy
@@ -37,6 +38,7 @@ _HOMES = {
     "Client": "client",
     "Policy": "policy",
     "Chunk": "chunk",
+    "History": "history",
     "Leftover": "observation",
     "OpenpiClient": "openpi",
     **dict.fromkeys(("BundleInfo", "Spec", "StateSpec", "ViewSpec"), "spec"),
