@@ -33,7 +33,8 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla, turbovla_authors, vla_jepa, xvla
+from goldens import (
+    act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla, turbovla_authors, vla_jepa, xvla)
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -169,6 +170,42 @@ def draw_act(seed):
     checkpoint = act.Checkpoint(policy, {view: frame[:2] for view, frame in frames.items()}, r.randint(1, 20), r.randint(1, 20), n_environment,
                                 exact=False, imagenet=r.random() < 0.5, dtype=r.choice(("F32", "F32", "BF16")), old=old)
     return act.case(seed, frames, checkpoint)
+
+
+def draw_diffusion(seed):
+    """The same for Diffusion Policy: scheduler, moments, cameras or none, norms, sizes of the U-Net; in one of ten a config that the reference
+    refuses or cannot run."""
+    r = random.Random(f"diffusion {seed}")
+    levels, groups = r.randint(1, 4), r.choice((1, 2, 4, 8))
+    widths = [8 * r.randint(1, 4) if i == 0 or groups == 8 else groups * r.randint(1, 10) for i in range(levels)]
+    moments, horizon = r.choice((1, 2, 2, 3, 4)), 2**levels * r.randint(1, 3)
+    height, width = r.randint(20, 80), r.randint(20, 80)
+    cameras, n_environment = {f"cam{i}": (height, width) for i in range(r.choice((0, 1, 1, 2, 3)))}, r.choice((0, 0, 1, 9))
+    n_environment = n_environment or (0 if cameras else 5)
+    n_train = r.choice((5, 20, 50, 100))
+    scheduler = r.choice(("DDPM", "DDPM", "DDIM"))
+    sized = {}
+    if cameras and r.random() < 0.4:
+        sized = {"resize_shape": [r.randint(20, 70), r.randint(20, 70)], "crop_ratio": r.choice((1.0, 0.9, 0.76, 0.5))}
+    elif r.random() < 0.5:
+        sized = {"crop_shape": [r.randint(12, height), r.randint(12, width)]}
+    old = bool(cameras) and not n_environment and r.random() < 0.2
+    states = ("MEAN_STD", "MIN_MAX") if old else MODES
+    modes = {"VISUAL": r.choice(("MEAN_STD",) if old else ("MEAN_STD", "MEAN_STD", "MIN_MAX", "QUANTILES", "IDENTITY")),
+             "STATE": r.choice(states), "ACTION": r.choice(states)}
+    if n_environment:
+        modes["ENV"] = r.choice(MODES)
+    policy = diffusion.sizes(
+        horizon, r.randint(1, max(horizon - moments + 1, 1)), widths, 2 * r.randint(2, 9), groups, r.randint(1, 9), n_obs_steps=moments,
+        kernel_size=r.choice((1, 3, 5, 5, 7)), use_film_scale_modulation=r.random() < 0.6, use_group_norm=r.random() < 0.5,
+        use_separate_rgb_encoder_per_camera=r.random() < 0.5, vision_backbone=r.choice(("resnet18", "resnet18", "resnet34")),
+        noise_scheduler_type=scheduler, num_train_timesteps=n_train, num_inference_steps=r.choice((None, r.randint(1, n_train))),
+        beta_schedule=r.choice(("squaredcos_cap_v2", "squaredcos_cap_v2", "linear", "scaled_linear", "sigmoid")),
+        beta_start=r.choice((0.0001, 0.001)), beta_end=r.choice((0.02, 0.05)), prediction_type=r.choice(("epsilon", "epsilon", "sample")),
+        clip_sample=r.random() < 0.7, clip_sample_range=r.choice((1.0, 0.5, 3.0)), normalization_mapping=modes, **sized)
+    checkpoint = diffusion.Checkpoint(policy, cameras, r.randint(1, 12), r.randint(1, 12), n_environment, exact=False,
+                                      dtype=r.choice(("F32", "F32", "BF16")), old=old)
+    return diffusion.case(seed, (r.choice(("png", "png", "jpg")),), checkpoint)
 
 
 def draw_turbovla(seed):
@@ -444,7 +481,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"act": draw_act, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
 

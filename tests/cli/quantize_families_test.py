@@ -25,6 +25,7 @@ PI = {"vision": pi.tower(D, 2, 3, FF), "lm": GEMMA, "expert": GEMMA}
 WIDE = {
     "act/two_views": {"policy": act.policy(9, D, 3, FF, (2, 1, 1))},
     "bitvla/micro": {"vision": bitvla.sizes(D, FF, 1, 3, image_size=28), "text": bitvla.sizes(D, FF, 1, 3, num_key_value_heads=1)},
+    "diffusion/environment": {"policy": all_cases()["diffusion/environment"].checkpoint.policy | {"down_dims": [D]}},
     "evo1/two_views": {"vision": evo1.tower(D, 2, 3, FF), "text": evo1.decoder(D, 3, 3, 1, FF), "head": evo1.head(2, 3, D, D)},
     "gr00t_n1_5/libero": {"vision": gr00t_n1_5.vision(D, 3, 3, FF, 28), "text": gr00t_n1_5.text(D, 5, 3, 1, 64, FF),
                           "head": gr00t.head(3, (6, 3, 64), (2, 3, 64), D, 14, 11, 6)},

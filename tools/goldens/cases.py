@@ -65,7 +65,7 @@ def write_observation(case, folder):
         state = {name: [next(numbers) for _ in range(n)] for name, n in widths.items()}
     observation = {"images": images, "state": state, "text": case.text}
     (folder / "observation.json").write_text(json.dumps(observation, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    shape = checkpoint.policy["chunk_size"], checkpoint.policy.get("max_action_dim", checkpoint.d_action)
+    shape = getattr(checkpoint, "noise_shape", None) or (checkpoint.policy["chunk_size"], checkpoint.policy.get("max_action_dim", checkpoint.d_action))
     if getattr(checkpoint, "noise", "normal") == "uniform":  # multiples of 2^-20: they survive what a reference makes of a draw
         noise = np.rint((2 * generator.uniform(*shape) - 1) * 2**20) / f32(2**20)
     else:

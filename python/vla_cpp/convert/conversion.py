@@ -123,13 +123,20 @@ def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, 
     for source in sorted(set(expected) | set(checkpoint.tensors)):
         entry, shape = checkpoint.tensors.get(source), expected.get(source)
         if shape is None and source in optional:
-            shape = optional[source].stored
-        _check_entry(source, entry, shape, plan, problems)
+            _check_dropped(source, entry, optional[source].stored, problems)
+        else:
+            _check_entry(source, entry, shape, plan, problems)
     dropped: Dict[str, List[str]] = {}
     for source, row in optional.items():
         if source in checkpoint.tensors:
             dropped.setdefault(row.reason, []).append(source)
     return dropped
+
+
+def _check_dropped(source: str, entry, shape, problems: Problems) -> None:
+    """Of any dtype: counters are whole numbers."""
+    if entry.shape != shape:
+        problems.add("tensor " + source, str(shape), str(entry.shape))
 
 
 def _check_entry(source: str, entry, shape, plan: Plan, problems: Problems) -> None:

@@ -35,7 +35,7 @@ FIXED = {"n_obs_steps": (1, "the reference reads one observation")}
 
 def check_keys(policy: Section, name: str, known: Set[str], fixed: Dict[str, Tuple[object, str]]) -> None:
     """Refuses unknown keys of config.json, and values that the runtime does not support. `name`: the reference's class."""
-    fixed = {**FIXED, **fixed}
+    fixed = {key: value for key, value in {**FIXED, **fixed}.items() if key not in known}
     for key in sorted(set(policy.values) - known - set(fixed) - IGNORED):
         policy.bad(
             key,

@@ -66,7 +66,8 @@ class TextEncoder:
     norm_eps: float = 0.0
 
 
-DOUBLES = ("policy.time_scale", "policy.rtc_ramp_rate", "time.min_period", "time.max_period", "solver.t_start", "solver.t_end")
+DOUBLES = {"policy.time_scale", "policy.rtc_ramp_rate", "time.min_period", "time.max_period"}
+DOUBLES |= {"solver." + name for name in ("t_start", "t_end", "beta_start", "beta_end", "clip")}
 KINDS = {int: "u32", float: "f32", str: "string"}
 Fields = Union[Vision, Language, TextEncoder, Mapping[str, object]]
 

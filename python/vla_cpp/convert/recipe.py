@@ -242,7 +242,10 @@ class _Reader:
         return choose(feature, modes.get(kind, "IDENTITY"), eps, found, self.context)
 
     def normalizes_pixels(self) -> bool:
-        return "VISUAL" in self.others.values()
+        """Or has none to normalize."""
+        features = member(self.checkpoint.config, "input_features", dict, "config.json").values()
+        has_cameras = any(isinstance(feature, dict) and feature.get("type") == "VISUAL" for feature in features)
+        return "VISUAL" in self.others.values() or not has_cameras
 
     def finish(self, file: str, required: Sequence[str]) -> None:
         for name in required:

@@ -10,7 +10,7 @@ import importlib
 import pkgutil
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Any, Dict, List, NamedTuple, Optional, Tuple
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class Weight(NamedTuple):
     plus_one: bool = False  # a norm of Gemma, which multiplies by 1 + w: the bundle holds the sum, a vector in float32
     keep_f32: bool = False  # a matrix that the reference keeps in float32 in bfloat16 too: not rounded if stored so
     first: Optional[int] = None  # of a source that stacks several tensors: the row at which this one's shape[0] rows begin
-    pick: Optional[Tuple[int, int]] = None  # one index of one axis of the source: (axis, index)
+    pick: Optional[Tuple[int, Union[int, Sequence[int]]]] = None  # one index of one axis of the source, or several: (axis, index)
     transpose: bool = False  # what is left after `pick`, stored as (in, out)
     in_bf16: bool = False  # the reference rounds it to bfloat16 when it loads it, whatever it is stored as
     batch_norm: str = ""  # a convolution's matrix, or the bias that it gets, with the frozen batch norm of this name behind it
@@ -135,6 +135,7 @@ TELLING = {
     "pi0": (PALIGEMMA, "model.action_time_mlp_in."),
     "pi05": (PALIGEMMA, "model.time_mlp_in."),
     "act": ("model.encoder_latent_input_proj.",),
+    "diffusion": ("diffusion.unet.",),
     "xvla": ("model.vlm.", "model.transformer."),
     "evo1": ("model.embedder.model.",),
     "turbovla": ("model.vl_interaction.",),

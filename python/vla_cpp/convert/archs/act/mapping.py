@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Tuple
+from typing import Dict, List, Mapping, NamedTuple, Sequence
 
 from ...bundle import Key
 from ...layers import Names, Rows, blocks, linear, norm, table, vector
@@ -60,17 +60,41 @@ def weights(s: Sizes) -> Rows:
     return rows + (norm("encoder.norm", "model.encoder.norm", d) if s.pre_norm else [])
 
 
-def resnet(n_block: Tuple[int, ...]) -> Rows:
-    rows = convolution("vision.stem", "conv1", "bn1", WIDTHS[0], 3, 7)
-    index, d_in = 0, WIDTHS[0]
+class Named(NamedTuple):
+    """A convolution of a ResNet: the bundle's name, torchvision's names of it and of the norm behind it, widths, side of the window."""
+
+    target: str
+    source: str
+    norm: str
+    d_out: int
+    d_in: int
+    size: int
+
+
+def resnet_convolutions(n_block: Sequence[int], renamed: Mapping[str, str] = {}) -> List[Named]:
+    """`renamed`: what a checkpoint calls torchvision's modules."""
+    found = [Named("stem", "conv1", "bn1", WIDTHS[0], 3, 7)]
+    d_in = WIDTHS[0]
     for stage, (n, d_out) in enumerate(zip(n_block, WIDTHS)):
         for i in range(n):
-            target, source = "vision.blk.{}.".format(index), "layer{}.{}.".format(stage + 1, i)
-            rows += convolution(target + "conv1", source + "conv1", source + "bn1", d_out, d_in, 3)
-            rows += convolution(target + "conv2", source + "conv2", source + "bn2", d_out, d_out, 3)
+            target, source = "blk.{}.".format(sum(n_block[:stage]) + i), "layer{}.{}.".format(stage + 1, i)
+            found.append(Named(target + "conv1", source + "conv1", source + "bn1", d_out, d_in, 3))
+            found.append(Named(target + "conv2", source + "conv2", source + "bn2", d_out, d_out, 3))
             if d_in != d_out:
-                rows += convolution(target + "shortcut", source + "downsample.0", source + "downsample.1", d_out, d_in, 1)
-            index, d_in = index + 1, d_out
+                found.append(Named(target + "shortcut", source + "downsample.0", source + "downsample.1", d_out, d_in, 1))
+            d_in = d_out
+
+    def their(name: str) -> str:
+        first, dot, rest = name.partition(".")
+        return renamed.get(first, first) + dot + rest
+
+    return [row._replace(source=their(row.source), norm=their(row.norm)) for row in found]
+
+
+def resnet(n_block: Sequence[int]) -> Rows:
+    rows: Rows = []
+    for row in resnet_convolutions(n_block):
+        rows += convolution("vision." + row.target, row.source, row.norm, row.d_out, row.d_in, row.size)
     return rows
 
 
