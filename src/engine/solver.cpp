@@ -66,9 +66,9 @@ Result<Solver> Solver::read(const Keys& keys) {
   return solver;
 }
 
-Tensor Solver::next(Graph& g, Tensor x, Tensor answer, Tensor noise, Tensor k) const {
-  if (diffusion) return denoised(g, x, answer, noise, k);
-  if (renoises) return blend(g, answer, reshape(g, noise, x.shape()), k);
+Tensor Solver::next(Graph& g, Tensor x, Tensor answer, Tensor act_noise, Tensor k) const {
+  if (diffusion) return denoised(g, x, answer, act_noise, k);
+  if (renoises) return blend(g, answer, reshape(g, act_noise, x.shape()), k);
   return direct ? answer : add(g, x, scale(g, answer, dt));
 }
 
@@ -83,7 +83,7 @@ Tensor Solver::after(Graph& g, Tensor k) const {
 
 /// The noise of step k is the one after the start's and those of steps before; after the last step it counts for
 /// nothing.
-Tensor Solver::denoised(Graph& g, Tensor x, Tensor answer, Tensor noise, Tensor k) const {
+Tensor Solver::denoised(Graph& g, Tensor x, Tensor answer, Tensor act_noise, Tensor k) const {
   using Step = DiffusionSchedule::Step;
   const auto& steps = diffusion->steps;
   const auto factor = [&](float Step::*number) {
@@ -98,7 +98,7 @@ Tensor Solver::denoised(Graph& g, Tensor x, Tensor answer, Tensor noise, Tensor 
   const Tensor rest = diffusion->draws ? x : predicted_noise;
   Tensor next = add(g, multiply(g, sample, factor(&Step::of_sample)), multiply(g, rest, factor(&Step::of_rest)));
   if (n_noise() == 1) return next;
-  const Tensor drawn = reshape(g, column(g, noise, after(g, k)), x.shape());
+  const Tensor drawn = reshape(g, column(g, act_noise, after(g, k)), x.shape());
   return add(g, next, multiply(g, drawn, factor(&Step::of_drawn)));
 }
 

@@ -16,8 +16,7 @@ namespace vla {
 /// The solver as data: the times at which the action head is evaluated, and the update rule.
 ///   euler, euler_float32  x <- x + dt * velocity(x, t_k), with equal steps from t_start to t_end
 ///   direct                one pass: x <- what the network gives, from a start of zeros
-///   ddpm, ddim            as the scheduler of this name (engine/diffusion_schedule.h); ddpm draws numbers for every
-///   step
+///   ddpm, ddim            as the scheduler of this name (engine/diffusion_schedule.h); ddpm draws noise in every step
 ///                         but the last
 ///   renoise               the network gives actions: x <- t * start + (1 - t) * actions, where t is the next step's
 ///                         time, from 1 to 0 (lerobot policies/xvla/modeling_xvla.py generate_actions)
@@ -44,15 +43,15 @@ struct Solver {
   /// models_pytorch/pi0_pytorch.py sample_actions.
   static Result<Solver> read(const Keys& keys);
 
-  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x. `noise` is the act's,
+  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x. `act_noise` is the act's,
   /// [d_action * horizon, n_noise], for a solver that reads it again, and `k` [1] i32 the step, for all but Euler's.
-  Tensor next(Graph& g, Tensor x, Tensor answer, Tensor noise = {}, Tensor k = {}) const;
+  Tensor next(Graph& g, Tensor x, Tensor answer, Tensor act_noise = {}, Tensor k = {}) const;
   /// The step after step k [1] i32, and 0 after the last.
   Tensor after(Graph& g, Tensor k) const;
 
  private:
   Tensor blend(Graph& g, Tensor answer, Tensor start, Tensor k) const;
-  Tensor denoised(Graph& g, Tensor x, Tensor answer, Tensor noise, Tensor k) const;
+  Tensor denoised(Graph& g, Tensor x, Tensor answer, Tensor act_noise, Tensor k) const;
 };
 
 }  // namespace vla
