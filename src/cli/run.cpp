@@ -256,9 +256,9 @@ Command add_run(CLI::App& app) {
   add_bundle(*command, options->bundle, true);
   command
       ->add_option("--image", options->images,
-                   "A frame: PNG, JPEG, or .npy (uint8 or float32 in [0, 1], height x width x 3)")
+                   "A frame: PNG, JPEG, or .npy (uint8 or float32 in [0, 1], height x width x 3); none for a policy "
+                   "without cameras")
       ->type_name("NAME=FILE")
-      ->required()
       ->allow_extra_args(false);
   add_absent(*command, options->absent);
   command

@@ -376,7 +376,8 @@ TEST_CASE("one graph has every operation there is, and gives the same on all ker
     const Tensor mixed = g.add(op::Attention{false}, {heads, heads, heads});
     const Tensor gated = multiply(g, activate(g, mixed, Activation::silu), scale(g, mixed, 0.5f));
     const Tensor one = g.add(op::Repeat{}, {reshape(g, slice_features(g, gated, 0, 1), {1, 3, 1, 1})}, {2, 3, 1, 1});
-    const Tensor all = concat(g, {gated, one}, 0);
+    const Tensor turned = g.add(op::Permute{{1, 0, 2, 3}}, {one});
+    const Tensor all = concat(g, {gated, reshape(g, turned, {2, 3, 1, 1})}, 0);
     const Slot* kept = r.slot(std::vector<float>(36 * 3), {36, 3, 1, 1});
     g.add(op::Write{const_cast<Slot*>(kept)}, {all});
     const Tensor result =

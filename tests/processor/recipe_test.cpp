@@ -156,7 +156,11 @@ TEST_CASE("ops in an order that has no meaning are refused") {
   recipe = sample();
   std::swap(recipe["state"][0], recipe["state"][1]);
   CHECK(contains(refused(recipe), "processor.recipe.state[1].op: expected nothing after pad"));
-  CHECK(contains(refused_at("/image", Json::array()), "processor.recipe.image: expected a letterbox"));
+  CHECK(contains(refused_at("/image", Json::array({Json{{"op", "affine"}, {"scale", 1.0}, {"shift", 0.0}}})),
+                 "processor.recipe.image[0].op: expected a letterbox or a resize first"));
+  recipe = sample();
+  recipe["image"] = Json::array();  // of a policy without views
+  CHECK(parse_recipe(recipe.dump()).ok());
   recipe = sample();
   recipe["text"].erase(1);
   CHECK(contains(refused(recipe), "processor.recipe.text: expected tokenize"));
