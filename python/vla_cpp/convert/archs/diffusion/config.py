@@ -106,7 +106,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     check_keys(policy, "DiffusionConfig", set(POLICY) | IGNORED, {})
     _check_words(policy)
     cameras, frame = _read_cameras(policy)
-    resized, image = _image_sizes(policy, frame)
+    resized, image = _image_sizes(policy, frame) if cameras else (None, frame)
     features = policy.get("input_features")
     has_environment = isinstance(features, dict) and ENVIRONMENT in features
     scheduler = policy.get("noise_scheduler_type")
