@@ -15,7 +15,7 @@ namespace {
 constexpr int kMaxParts = 4;  // most code points that one code point decomposes to
 
 /// Length of the prefix whose characters take part in normalization (or do not, by `wanted`), in bytes.
-std::size_t run(std::string_view text, bool wanted) {
+std::size_t prefix_of(std::string_view text, bool wanted) {
   std::size_t size = 0;
   while (size < text.size()) {
     const unicode::Char c = unicode::first(text.substr(size));
@@ -73,10 +73,10 @@ std::string normal(std::string_view text, bool composed) {
   out.reserve(text.size());
   while (!text.empty()) {
     // A character that does not take part blocks composition and reordering across it.
-    std::size_t size = run(text, false);
+    std::size_t size = prefix_of(text, false);
     out.append(text.substr(0, size));
     text.remove_prefix(size);
-    size = run(text, true);
+    size = prefix_of(text, true);
     if (size > 0) append_normal(text.substr(0, size), composed, out);
     text.remove_prefix(size);
   }
