@@ -108,7 +108,7 @@ def stated_sizes(case):
 def cases(only):
     """One of each family and of each way in which its pipeline may go: those of GR00T keep aspects or pad."""
     chosen = [name for name in all_cases() if name.split("/")[1] in
-              ("two_views", "pre_norm", "lerobot", "modes", "libero", "aspect", "relative", "four_by_three", "camera", "small", "no_state")]
+              ("two_views", "pre_norm", "lerobot", "modes", "libero", "aspect", "relative", "four_by_three", "camera", "small", "no_state", "ddpm", "ddim", "environment")]
     return [name for name in chosen if wanted(name, only)]
 
 

@@ -178,7 +178,8 @@ def draw_diffusion(seed):
     r = random.Random(f"diffusion {seed}")
     levels, groups = r.randint(1, 4), r.choice((1, 2, 4, 8))
     widths = [8 * r.randint(1, 4) if i == 0 or groups == 8 else groups * r.randint(1, 10) for i in range(levels)]
-    moments, horizon = r.choice((1, 2, 2, 3, 4)), 2**levels * r.randint(1, 3)
+    horizon = 2**levels * r.randint(1, 3)
+    moments = min(r.choice((1, 2, 2, 3, 4)), horizon)
     height, width = r.randint(20, 80), r.randint(20, 80)
     cameras, n_environment = {f"cam{i}": (height, width) for i in range(r.choice((0, 1, 1, 2, 3)))}, r.choice((0, 0, 1, 9))
     n_environment = n_environment or (0 if cameras else 5)
@@ -196,7 +197,7 @@ def draw_diffusion(seed):
     if n_environment:
         modes["ENV"] = r.choice(MODES)
     policy = diffusion.sizes(
-        horizon, r.randint(1, max(horizon - moments + 1, 1)), widths, 2 * r.randint(2, 9), groups, r.randint(1, 9), n_obs_steps=moments,
+        horizon, r.randint(1, horizon - moments + 1), widths, 2 * r.randint(2, 9), groups, r.randint(1, 9), n_obs_steps=moments,
         kernel_size=r.choice((1, 3, 5, 5, 7)), use_film_scale_modulation=r.random() < 0.6, use_group_norm=r.random() < 0.5,
         use_separate_rgb_encoder_per_camera=r.random() < 0.5, vision_backbone=r.choice(("resnet18", "resnet18", "resnet34")),
         noise_scheduler_type=scheduler, num_train_timesteps=n_train, num_inference_steps=r.choice((None, r.randint(1, n_train))),

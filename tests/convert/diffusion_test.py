@@ -95,10 +95,10 @@ def test_frames_are_cropped_as_bytes_and_resized_in_floats(planned):
 
         return [{key: value for key, value in op.items() if key != "filter"} for op in image_ops(sizes)]
 
-    frame, crop = {"width": 40, "height": 33}, {"width": 21, "height": 30}
+    frame, crop = {"width": 40, "height": 33}, {"width": 33, "height": 30}
     resized = {"op": "resize_floats", "width": 64, "height": 50, "from_width": 40, "from_height": 33}
     assert image() == [{"op": "camera_size", **frame}, {"op": "size", **frame}]
-    assert image(crop_shape=[30, 21], crop_ratio=0.5) == [{"op": "camera_size", **frame}, {"op": "center_crop", **crop}, {"op": "size", **crop}]
+    assert image(crop_shape=[30, 33], crop_ratio=0.5) == [{"op": "camera_size", **frame}, {"op": "center_crop", **crop}, {"op": "size", **crop}]
     assert image(resize_shape=[50, 64]) == [resized]
     assert image(resize_shape=[50, 64], crop_shape=[9, 9]) == [resized]  # the class drops such a crop
     assert image(resize_shape=[50, 64], crop_ratio=0.75) == [resized, {"op": "crop_floats", "width": 48, "height": 37}]
@@ -150,6 +150,7 @@ def test_matrices_of_convolutions_have_their_columns_place_by_place(folder, tmp_
         ("down_dims", [12, 16], "down_dims: expected a first width that 8 divides"),
         ("down_dims", [], "down_dims: expected 1 to 12 widths"),
         ("crop_shape", [34, 40], "crop_shape: expected at most the frames' [33, 40]"),
+        ("crop_shape", [30, 32], "input_features: expected images of more than 32 pixels on one side, since use_group_norm is false, found 32 x 30"),
         ("crop_shape", [5], "crop_shape: expected [height, width]"),
         ("crop_ratio", 1.5, "crop_ratio: expected a number in (0, 1]"),
         ("soft_prompt", 1, "soft_prompt: expected a key of DiffusionConfig"),

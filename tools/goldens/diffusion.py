@@ -5,6 +5,7 @@
 The towers are torchvision's own ResNet-18 and -34, which have one width only: frames are small, so that what they give is.
 """
 
+import functools
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -252,8 +253,36 @@ def load(checkpoint, dtype="float32"):
     policy = DiffusionPolicy.from_pretrained(folder, config=config, strict=not act.is_old(checkpoint)).float().eval()
     if dtype == "published":
         policy.predict_action_chunk = torch.autocast("cpu", torch.bfloat16)(policy.predict_action_chunk)
+    policy.predict_action_chunk = functools.partial(chunk_of, policy, policy.predict_action_chunk)
     before, after = act.migrated(policy, checkpoint) if act.is_old(checkpoint) else make_pre_post_processors(config, pretrained_path=folder)
     return policy, lambda batch: Moments(config, before).of(batch), after
+
+
+def chunk_of(policy, predict, batch, noise):
+    """What the policy gives of moments, one after the other. noise (1, rows, d_action): the start's, then the scheduler's draws."""
+    from diffusers.schedulers import scheduling_ddpm
+
+    rows = policy.config.horizon
+    draws = iter(noise[0].reshape(-1, rows, noise.shape[-1])[1:])
+    scheduling_ddpm.randn_tensor, draw = lambda shape, **_: next(draws).reshape(shape), scheduling_ddpm.randn_tensor
+    policy.reset()
+    try:
+        return predict(last_of(policy, batch["moments"]), noise=noise[:, :rows])
+    finally:
+        scheduling_ddpm.randn_tensor = draw
+
+
+def last_of(policy, moments):
+    """Fills the queues as select_action does, which also stacks cameras. Returns the last moment."""
+    import torch
+    from lerobot.policies.utils import populate_queues
+
+    for moment in moments:
+        last = {name: x for name, x in moment.items() if name != "action"}
+        if policy.config.image_features:
+            last["observation.images"] = torch.stack([moment[key] for key in policy.config.image_features], dim=-4)
+        policy._queues = populate_queues(policy._queues, last)
+    return last
 
 
 class Moments:
@@ -287,7 +316,7 @@ class Recorder(Taps):
             self.before(encoder.backbone, self.pixels.append)
             blocks = [block for stage in range(4, 8) for block in encoder.backbone[stage]]
             for j, block in enumerate(blocks):
-                if j in (len(encoder.backbone[4]) - 1, len(blocks) - 1):
+                if j in (0, len(blocks) - 1):
                     self.after(block, lambda x, name=f"{at}blk.{j}": self.put(name, x.permute(0, 2, 3, 1)))
             self.after(encoder.pool, lambda x, name=f"{at}keypoints": self.put(name, x.flatten(1)))
             self.after(encoder.out, lambda x, name=f"{at}out": self.put(name, x))
@@ -302,17 +331,20 @@ class Recorder(Taps):
         self.step += 1
         if self.step == 0:
             self.put("prefix", kwargs["global_cond"][0])
-        else:
+        elif self.is_told(self.step - 1):
             self.put(f"step.{self.step - 1}.x", args[0][0])
+
+    def is_told(self, step):
+        """Whether the rounding of the network's output is not multiplied by more than 100 in x: a predicted sample is divided by the root of a
+        product of alphas, which the first steps of a schedule have near 0."""
+        scheduler = self.policy.diffusion.noise_scheduler
+        return scheduler.config.prediction_type == "sample" or scheduler.alphas_cumprod[scheduler.timesteps[step]] > 1e-4
 
     def run(self, batch, noise):
         """Every tap of one inference."""
         import torch
-        from diffusers.schedulers import scheduling_ddpm
 
         model, moments, cameras = self.policy.diffusion, batch["moments"], len(self.policy.config.image_features)
-        rows = self.policy.config.horizon
-        draws = iter(noise[0].reshape(-1, rows, noise.shape[-1])[1:])
         sample = model.conditional_sample
 
         def whole(*args, **kwargs):
@@ -321,14 +353,8 @@ class Recorder(Taps):
             return x
 
         model.conditional_sample = whole
-        scheduling_ddpm.randn_tensor, draw = lambda shape, **_: next(draws).reshape(shape), scheduling_ddpm.randn_tensor
-        try:
-            with torch.inference_mode():
-                self.policy.reset()
-                self.fill(moments)
-                self.put("chunk", self.policy.predict_action_chunk(self.last, noise=noise[:, :rows])[0])
-        finally:
-            scheduling_ddpm.randn_tensor = draw
+        with torch.inference_mode():
+            self.put("chunk", self.policy.predict_action_chunk(batch, noise=noise)[0])
         if self.pixels:
             self.put("pixels", torch.cat(self.pixels))
         if len(self.pixels) == 1:  # of one encoder: ordered by moment, then by camera; the runtime's the other way round
@@ -338,14 +364,3 @@ class Recorder(Taps):
         parts = [moment[name][0] for name in ("observation.state", ENVIRONMENT) if name in moments[0] for moment in moments]
         self.put("state", torch.cat(parts))
         return self.taps
-
-    def fill(self, moments):
-        """The queues as select_action leaves them, which also stacks cameras."""
-        import torch
-        from lerobot.policies.utils import populate_queues
-
-        for moment in moments:
-            self.last = {name: x for name, x in moment.items() if name != "action"}
-            if self.policy.config.image_features:
-                self.last["observation.images"] = torch.stack([moment[key] for key in self.policy.config.image_features], dim=-4)
-            self.policy._queues = populate_queues(self.policy._queues, self.last)

@@ -166,6 +166,9 @@ def _check_words(policy: Section) -> None:
 def _check_together(policy: Section, s: Sizes) -> None:
     if s.n_step > s.n_train_step:
         policy.bad("num_inference_steps", "at most num_train_timesteps {}".format(s.n_train_step), hint="the reference refuses it too")
+    if s.cameras and not s.group_norm and s.n_cell == 1:
+        expected = "images of more than 32 pixels on one side, since use_group_norm is false"
+        policy.bad("input_features", expected, "{} x {}".format(*s.image), "the reference refuses it too: its batch norms are built with one image")
     if s.horizon % 2 ** len(s.widths):
         hint = "the reference refuses it too"
         policy.bad("horizon", "a multiple of {}, which down_dims divide it by".format(2 ** len(s.widths)), hint=hint)
