@@ -178,7 +178,7 @@ def draw_diffusion(seed):
     r = random.Random(f"diffusion {seed}")
     levels, groups = r.randint(1, 4), r.choice((1, 2, 4, 8))
     widths = [8 * r.randint(1, 4) if i == 0 or groups == 8 else groups * r.randint(1, 10) for i in range(levels)]
-    horizon = 2**levels * r.randint(1, 3)
+    horizon = max(4, 2**levels * r.randint(1, 3))  # a norm of two values is their order
     moments = min(r.choice((1, 2, 2, 3, 4)), horizon)
     height, width = r.randint(20, 80), r.randint(20, 80)
     cameras, n_environment = {f"cam{i}": (height, width) for i in range(r.choice((0, 1, 1, 2, 3)))}, r.choice((0, 0, 1, 9))

@@ -204,6 +204,8 @@ Status run(RunOptions& options) {
   Observation observation;
   observation.text = options.text;
   observation.reject_out_of_range = options.strict_state;
+  if (options.images.empty() && !robot.processor().views().names().empty())
+    return Error{Code::usage, "--image", "the frames of " + robot.processor().views().listed(), "none"};
   for (const std::string& image : options.images) VLA_CHECK(add_image(observation, image, robot.processor().views()));
   const FeatureNames& features = robot.processor().states();
   if (options.states.empty() && !features.names().empty())

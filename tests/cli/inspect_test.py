@@ -97,6 +97,7 @@ def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
     case = Golden(name)
     manifest = json.loads(vla("inspect", "--manifest", case.arch).out)
     bundle = [n for n in tensors(case.bundle) if not n.startswith("stats.")]
+    declared = without_numbers(p["name"] for p in manifest["parameters"])
     # What these have, or lack, beside the published size.
     other = {
         "act/environment": {"environment_in.weight", "environment_in.bias"},
@@ -106,9 +107,18 @@ def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
         "turbovla_authors/exact_fit": {"vision.registers.weight"},
         "turbovla_authors/last_block": {"vision.post_norm.weight", "vision.post_norm.bias"},
         "turbovla_authors/zero_fill": {"place.weight", "place_scale.weight"},
+        "diffusion/ddim": {n for n in declared if n.startswith("vision.")} | encoder_with_batch_norms("vision.#"),
+        "diffusion/environment": {n for n in declared if n.startswith(("unet.down", "unet.up"))},
+        "diffusion/no_cameras": {n for n in declared if n.startswith("vision.")},
         "vla_jepa/camera": {f"state_{layer}.{kind}" for layer in ("in", "out") for kind in ("weight", "bias")},
     }
-    assert without_numbers(bundle) == without_numbers(p["name"] for p in manifest["parameters"]) ^ other.get(name, set())
+    assert without_numbers(bundle) == declared ^ other.get(name, set())
+
+
+def encoder_with_batch_norms(at):
+    """Names of a Diffusion Policy's encoder whose norms are part of its convolutions."""
+    layers = ["stem", *(f"blk.#.{part}" for part in ("conv1", "conv2", "shortcut")), "keypoints", "out"]
+    return {f"{at}.{layer}.{kind}" for layer in layers for kind in ("weight", "bias")} | {f"{at}.keypoints.places"}
 
 
 def test_the_manifest_of_an_unknown_architecture_is_unsupported(vla):

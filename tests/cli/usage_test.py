@@ -14,7 +14,6 @@ import pytest
         ["inspect"],
         ["compare"],
         ["compare", "only-one.gguf"],
-        ["run", "policy.gguf"],
         ["--frobnicate"],
         ["inspect", "policy.gguf", "--frobnicate"],
         ["inspect", "policy.gguf", "--manifest", "smolvla"],
