@@ -49,6 +49,8 @@ int byte_of_symbol(std::uint32_t code_point) {
   return found == symbols.end() ? -1 : static_cast<int>(found - symbols.begin());
 }
 
+std::string bytes_of_token(const std::string& text) { return bytes_of(text).value_or(text); }
+
 Result<Bpe> Bpe::create(const std::vector<std::string>& tokens, const std::vector<std::string>& merges,
                         bool ignore_merges, const std::vector<bool>& is_added) {
   Bpe bpe;

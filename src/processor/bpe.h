@@ -18,6 +18,9 @@ namespace vla {
 /// itself); -1 for other characters.
 int byte_of_symbol(std::uint32_t code_point);
 
+/// The bytes that a token of this alphabet stands for; its own text where a character is none of it.
+std::string bytes_of_token(const std::string& text);
+
 /// Byte-level byte-pair encoding of one word, whose symbols are bytes. Source: tokenizers models/bpe/model.rs.
 class Bpe {
  public:

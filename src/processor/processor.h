@@ -12,6 +12,7 @@
 
 #include "base/result.h"
 #include "bundle/bundle.h"
+#include "processor/action_tokens.h"
 #include "processor/image.h"
 #include "processor/names.h"
 #include "processor/recipe.h"
@@ -49,11 +50,11 @@ inline constexpr double kStateBound = 10.0;
 /// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.
 class Processor {
  public:
-  /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*` and `lm.n_vocab` if the recipe has a text,
-  /// `stats.*`, `policy.d_state`,
-  /// `policy.d_action`, `policy.view_starts*` if the text has places for views, `policy.horizon` if the recipe drops
-  /// rows, and checks that they fit each other. The bundle may be closed afterwards. Errors: bad_bundle.
-  /// `tokenizer`: shared with a processor of the same `tokenizer.*` and `lm.n_vocab`; null makes one.
+  /// Reads `processor.*`, `observation.*`, `action.names`, `action_tokens.*`, `tokenizer.*` and `lm.n_vocab` if the
+  /// recipe has a text, `stats.*`, `policy.d_state`, `policy.d_action`, `policy.view_starts*` if the text has places
+  /// for views, `policy.horizon` if the recipe drops rows, and checks that they fit each other. The bundle may be
+  /// closed afterwards. Errors: bad_bundle. `tokenizer`: shared with a processor of the same `tokenizer.*` and
+  /// `lm.n_vocab`; null makes one.
   static Result<Processor> create(const Bundle& bundle, std::shared_ptr<const Tokenizer> tokenizer = nullptr);
 
   /// All three parts below. Errors: bad_observation.
@@ -106,6 +107,8 @@ class Processor {
   const Recipe& recipe() const { return recipe_; }
   /// Null where the policy reads no instruction.
   const std::shared_ptr<const Tokenizer>& tokenizer() const { return tokenizer_; }
+  /// Where the network answers with tokens that are decoded to a chunk.
+  const std::optional<ActionTokens>& action_tokens() const { return action_tokens_; }
   /// Features that --identity-stats left unnormalized, which every answer reports.
   const std::vector<std::string>& degraded() const { return degraded_; }
 
@@ -139,6 +142,7 @@ class Processor {
   double state_bound_ = kStateBound;
   Recipe recipe_;
   std::shared_ptr<const Tokenizer> tokenizer_;
+  std::optional<ActionTokens> action_tokens_;
   /// If the text has places for views: the tokens of every prompt up to the last place, or from the first place on,
   /// and the token of a place.
   std::vector<std::int32_t> view_tokens_;

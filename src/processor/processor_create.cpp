@@ -58,6 +58,7 @@ Result<Processor> Processor::create(const Bundle& bundle, std::shared_ptr<const 
   VLA_CHECK(processor.read_features(bundle));
   VLA_CHECK(processor.bind_state(bundle));
   VLA_CHECK(processor.bind_action(bundle));
+  VLA_TRY(processor.action_tokens_, ActionTokens::read(keys));
   processor.tokenizer_ = std::move(tokenizer);
   const bool has_text = processor.recipe_.max_tokens > 0;
   if (keys.has("lm.n_vocab") != has_text)

@@ -117,6 +117,9 @@ Status Tokenizer::read_byte_level(const Keys& keys, const std::vector<std::strin
 Status Tokenizer::read_byte_fallback(const Keys& keys, const std::vector<std::string>& tokens) {
   VLA_TRY(const std::vector<std::string> merges, keys.strings("tokenizer.merges"));
   VLA_TRY(prefix_, read_around(keys, "tokenizer.prefix_ids", tokens.size()));
+  if (keys.has("tokenizer.suffix_ids")) {
+    VLA_TRY(suffix_, read_around(keys, "tokenizer.suffix_ids", tokens.size()));
+  }
   VLA_TRY(model_, ByteFallbackBpe::create(tokens, merges));
   return {};
 }

@@ -5,14 +5,17 @@
 //   reference_tool tokenize KEYS.json      stdin: u32 length, text, ...         stdout: u32 count, i32 ids, ...
 //   reference_tool image WIDTH HEIGHT [center | pillow | FILTER]
 //                                          stdin: u32 length, image file, ...   stdout: u32 count, f32 pixels, ...
-// FILTER is one of the recipe's op "resize". KEYS.json holds the tokenizer.* keys of a bundle as one JSON object. An
-// input that is refused gives count 0 and a line on stderr.
+//   reference_tool actions KEYS.json HORIZON D_ACTION
+//                                          stdin: u32 bytes, i32 ids, ...      stdout: u32 count, f32 chunk, ...
+// FILTER is one of the recipe's op "resize". KEYS.json holds the tokenizer.* keys of a bundle as one JSON object, or
+// those that ActionTokens reads. An input that is refused gives count 0 and a line on stderr.
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
 #include <fstream>
 #include <iterator>
 
+#include "processor/action_tokens.h"
 #include "processor/image.h"
 #include "processor/ops/letterbox.h"
 #include "processor/ops/planes.h"
@@ -51,6 +54,22 @@ int tokenize(const char* path) {
   return 0;
 }
 
+int actions(const char* path, int horizon, int d_action) {
+  std::ifstream file(path);
+  const auto tokens = vla::ActionTokens::read(vla::test::keys_of(nlohmann::json::parse(file, nullptr, false)));
+  if (!tokens || !*tokens)
+    return std::fprintf(stderr, "%s\n", tokens ? "no keys" : tokens.error().message().c_str()), 1;
+  std::string item;
+  while (read_item(item)) {
+    std::vector<std::int32_t> ids(item.size() / sizeof(std::int32_t));
+    std::memcpy(ids.data(), item.data(), ids.size() * sizeof(std::int32_t));
+    auto chunk = (*tokens)->decode(ids, horizon, d_action);
+    if (!chunk) std::fprintf(stderr, "%s\n", chunk.error().message().c_str());
+    write_items(chunk ? *chunk : std::vector<float>{});
+  }
+  return 0;
+}
+
 vla::Status fit(const vla::Frame& frame, int width, int height, const std::string& how, std::span<float> out) {
   if (const auto* filter = vla::find_resize_filter("resize", how))
     return vla::resize(frame, {width, height, filter}, out, "stdin");
@@ -81,8 +100,13 @@ int image(int width, int height, const std::string& how) {
 
 int main(int argc, char** argv) {
   if (argc == 3 && std::strcmp(argv[1], "tokenize") == 0) return tokenize(argv[2]);
+  if (argc == 5 && std::strcmp(argv[1], "actions") == 0)
+    return actions(argv[2], std::atoi(argv[3]), std::atoi(argv[4]));
   if ((argc == 4 || argc == 5) && std::strcmp(argv[1], "image") == 0)
     return image(std::atoi(argv[2]), std::atoi(argv[3]), argc == 5 ? argv[4] : "");
-  std::fputs("usage: reference_tool tokenize KEYS.json | image WIDTH HEIGHT [center | pillow | FILTER]\n", stderr);
+  std::fputs(
+      "usage: reference_tool tokenize KEYS.json | image WIDTH HEIGHT [center | pillow | FILTER] | actions KEYS.json "
+      "HORIZON D_ACTION\n",
+      stderr);
   return 2;
 }

@@ -10,13 +10,15 @@
 
 namespace vla::test {
 
-/// The tokenizer.* keys of a bundle, written as one JSON object.
+/// Keys of a bundle, written as one JSON object. A whole number is an integer of the bundle, any other one in double
+/// precision.
 inline Keys keys_of(const nlohmann::json& document) {
   Keys keys;
   for (const auto& item : document.items()) {
     if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
     if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
-    if (item.value().is_number()) keys.set(item.key(), item.value().get<std::int64_t>());
+    if (item.value().is_number_float()) keys.set(item.key(), item.value().get<double>());
+    if (item.value().is_number_integer()) keys.set(item.key(), item.value().get<std::int64_t>());
     if (!item.value().is_array()) continue;
     if (item.key().ends_with("_ids")) {
       keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
