@@ -51,8 +51,7 @@ class Encoder:
         self.symbols = byte_symbols()
         self.whole_words = _value(keys, "tokenizer.ignore_merges")
         self.id_of = {text: number for number, text in enumerate(_value(keys, "tokenizer.tokens"))}
-        merges = _value(keys, "tokenizer.merges")
-        self.ranks: Dict[Tuple[str, ...], int] = {tuple(merge.split(" ")): rank for rank, merge in enumerate(merges)}
+        self.ranks = ranks_of(keys)
 
     def ids(self, text: str) -> List[int]:
         return [self.id_of.get(part, -1) for word in WORDS.findall(text) for part in self.word(word)]
@@ -61,16 +60,24 @@ class Encoder:
         parts = [self.symbols[byte] for byte in word.encode("ascii")]
         if self.whole_words and "".join(parts) in self.id_of:
             return ["".join(parts)]
-        while len(parts) > 1:
-            pairs = list(zip(parts, parts[1:]))
-            rank, at = min((self.ranks.get(pair, len(self.ranks)), i) for i, pair in enumerate(pairs))
-            if rank == len(self.ranks):
-                break
-            # Every occurrence of the pair merges, from the left.
-            pair, merged, i = pairs[at], [], 0
-            while i < len(parts):
-                step = 2 if tuple(parts[i : i + 2]) == pair else 1
-                merged.append("".join(parts[i : i + step]))
-                i += step
-            parts = merged
-        return parts
+        return merge_all(parts, self.ranks)
+
+
+def ranks_of(keys: Sequence[Key]) -> Dict[Tuple[str, ...], int]:
+    return {tuple(merge.split(" ")): rank for rank, merge in enumerate(_value(keys, "tokenizer.merges"))}
+
+
+def merge_all(parts: List[str], ranks: Dict[Tuple[str, ...], int]) -> List[str]:
+    while len(parts) > 1:
+        pairs = list(zip(parts, parts[1:]))
+        rank, at = min((ranks.get(pair, len(ranks)), i) for i, pair in enumerate(pairs))
+        if rank == len(ranks):
+            break
+        # Every occurrence of the pair merges, from the left.
+        pair, merged, i = pairs[at], [], 0
+        while i < len(parts):
+            step = 2 if tuple(parts[i : i + 2]) == pair else 1
+            merged.append("".join(parts[i : i + step]))
+            i += step
+        parts = merged
+    return parts

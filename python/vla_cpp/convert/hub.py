@@ -31,6 +31,7 @@ HUB_PATTERNS = [
     "mp_rank_00_model_states.pt",
     "*_checkpoint.pt",
     "tokenizer/*",
+    "action_tokenizer/*",
     "vlm/*.json",
     "vlm/merges.txt",
     "processor/*.json",
@@ -47,6 +48,7 @@ BACKBONE_PATTERNS = [
     "preprocessor_config.json",
     "chat_template.*",
 ]
+ACTION_TOKENIZER_PATTERNS = ["processor_config.json", "tokenizer.json", "tokenizer_config.json", "bpe_tokenizer/*.json"]
 HUB = "hub:"
 HUB_FORM = "hub:OWNER/NAME@REVISION"
 HUB_NAME = r"\w[\w.-]*/\w[\w.-]*"

@@ -174,7 +174,7 @@ def decoder(lm: Language, source: str, kind: Decoder = LLAMA, end: str = "norm",
     for i in range(lm.n_layer):
         own = _layer(lm, source, i, kind)
         rows += own if end != "cache" or i < lm.n_layer - 1 else [row for row in own if row.target.endswith(KEPT_OF_LAST)]
-    return rows + (rms_norm("lm.norm", source + "norm", lm.d_model) if end == "norm" else [])
+    return rows + (kind.norm("lm.norm", source + "norm", lm.d_model) if end == "norm" else [])
 
 
 def _layer(lm: Language, source: str, i: int, kind: Decoder = LLAMA) -> Rows:

@@ -85,6 +85,11 @@ DOMAIN = Option(
     "X-VLA: number of the domain, that of the preprocessor by default; A,B,... puts several into one bundle, all every one",
     "TAG",
 )
+ACTION_TOKENIZER = Option(
+    "--action-tokenizer",
+    "π0-FAST: folder of the tokenizer of actions, where it is not action_tokenizer/ inside the checkpoint, or " + HUB,
+    "DIR",
+)
 
 
 def variant(what: str) -> Option:

@@ -156,6 +156,8 @@ class _Reader:
             self.problems.unsupported(where, "normalization before it and tokenization after it", "another order")
         self.result.discrete_state = True
 
+    _pi0_fast_prepare_state_tokenizer_step = _pi05_prepare_state_tokenizer_step
+
     def _relative_actions(self, where: str, config: dict, step: dict) -> None:
         if "normalizer_processor" in self.seen:
             self.problems.unsupported(where, "the state of the robot, before normalization", "the opposite order")

@@ -45,6 +45,7 @@ NO_ROW = -1  # the id of an added token that the embedding has no row for
 class TokenizerPlan(NamedTuple):
     keys: List[Key]  # the bundle's `tokenizer.*`
     truncate: str  # the side on which a text that is too long loses tokens: left or right
+    n_own: int  # tokens of the model itself, without added ones: transformers' vocab_size
 
     @property
     def tokens(self) -> List[str]:
@@ -72,7 +73,7 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
     ]
     if kind is not tokenizer_wordpiece:
         keys.insert(2, Key("tokenizer.merges", "string[]", merges_of(model.get("merges"), model["vocab"], problems)))
-    return TokenizerPlan(keys, _truncation_side(spec, config, problems))
+    return TokenizerPlan(keys, _truncation_side(spec, config, problems), len(model["vocab"]))
 
 
 def _kind(model: dict):

@@ -17,7 +17,7 @@ import numpy as np
 from ..bundle import Key
 from ..checkpoint import LEROBOT, OPENPI, Checkpoint, Layout, Tensors, read_stored
 from ..errors import Code, Problems, refuse
-from ..options import COMMON, DOMAIN, IDENTITY_STATS, POSITION_PRECISION, WIDTHS, Option, stats, variant
+from ..options import ACTION_TOKENIZER, COMMON, DOMAIN, IDENTITY_STATS, POSITION_PRECISION, WIDTHS, Option, stats, variant
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
 TERNARY, SCALE = "ternary", "scale"  # of a matrix of -1, 0 and 1 and one factor: its codes, and the factor
@@ -103,7 +103,7 @@ def _openpi_tensors(folder: str, problems: Problems) -> Tensors:
 
 LAYOUTS = {
     LEROBOT: Layout(
-        "LeRobot", (IDENTITY_STATS, POSITION_PRECISION, WIDTHS, DOMAIN, stats("whose, where the weights have those of several data sets"))
+        "LeRobot", (IDENTITY_STATS, POSITION_PRECISION, WIDTHS, DOMAIN, ACTION_TOKENIZER, stats("whose, where the weights have those of several data sets"))
     ),
     OPENPI: Layout("openpi", (variant("the training configuration, e.g. pi05_droid"),), files=("params/_METADATA",), read=_openpi_tensors),
 }
@@ -163,6 +163,8 @@ def check_options(layout: str, config: dict, options: Options) -> None:
             if layout == LEROBOT:
                 found = "config.json of type {}, which states everything itself".format(config.get("type"))
             problems.add(option.flag, wanted, found, "leave the option out", Code.USAGE)
+    if options.action_tokenizer and layout == LEROBOT and config.get("type") != "pi0_fast":
+        problems.add(ACTION_TOKENIZER.flag, "a checkpoint of π0-FAST", "type {}".format(config.get("type")), "leave the option out", Code.USAGE)
     problems.raise_any()
 
 

@@ -70,17 +70,29 @@ def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> 
     """The sizes of the three towers; `policy` names the variants of two."""
     dims = _dims(checkpoint, problems)
     lm, expert = (_gemma(policy, key, dims, checkpoint, problems) for key in ("paligemma_variant", "action_expert_variant"))
-    vision = Section(DIMS_FILE + ": vision", member(dims, "vision", dict, DIMS_FILE), SIGLIP, problems)
-    _known(vision)
     for key in ("depth", "num_heads", "num_kv_heads", "head_dim"):
         if lm.count(key) != expert.count(key):
             expert.bad(key, "that of the language model, {}: the layers attend together".format(lm.count(key)))
+    if expert.count("width") % 2:
+        expert.bad("width", "an even number, for the time embedding")
+    sizes = _paligemma(dims, lm, problems)
+    sizes.d_expert, sizes.d_expert_ff = expert.count("width"), expert.count("mlp_dim")
+    return sizes
+
+
+def read_paligemma(policy: Section, checkpoint: Checkpoint, problems: Problems) -> Sizes:
+    """The same without an expert."""
+    dims = _dims(checkpoint, problems)
+    return _paligemma(dims, _gemma(policy, "paligemma_variant", dims, checkpoint, problems), problems)
+
+
+def _paligemma(dims: dict, lm: Section, problems: Problems) -> Sizes:
+    vision = Section(DIMS_FILE + ": vision", member(dims, "vision", dict, DIMS_FILE), SIGLIP, problems)
+    _known(vision)
     if lm.count("num_heads") % lm.count("num_kv_heads"):
         lm.bad("num_kv_heads", "a divisor of num_heads {}".format(lm.count("num_heads")))
     if lm.count("head_dim") % 2:
         lm.bad("head_dim", "an even number, for the rotary embedding")
-    if expert.count("width") % 2:
-        expert.bad("width", "an even number, for the time embedding")
     top = Section(DIMS_FILE, dims, {"vocab_size": N_VOCAB}, problems)
     image_size = vision.count("image_size", 0) if "image_size" in vision.values else 0
     tower = read_vision(vision, image_size, vision.count("patch_size"))
@@ -96,7 +108,7 @@ def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> 
         norm_eps=EPS,
         rope_base=ROPE_BASE,
     )
-    return Sizes(tower, language, expert.count("width"), expert.count("mlp_dim"))
+    return Sizes(tower, language)
 
 
 def check_image(policy: Section, key: str, sizes: Sizes, resolution) -> None:
@@ -219,12 +231,19 @@ def rounded(weight: Weight) -> bool:
     return weight.target.startswith(("lm.", "expert.blk.")) and ".dense." not in weight.target
 
 
-def weights(family: Family, s: Sizes, checkpoint: Checkpoint) -> Rows:
-    d, tokens = s.d_expert, EMBEDDING if EMBEDDING in checkpoint.tensors else LM_HEAD
+def paligemma(s: Sizes, checkpoint: Checkpoint, end: str) -> Rows:
+    """`end`: as of networks.decoder."""
     return [
         *siglip(VISION, s.vision),
         *linear("projector", PROJECTOR, s.lm.d_model, s.vision.d_model),
-        *decoder(s.lm, LM, GEMMA, "cache", tokens),
+        *decoder(s.lm, LM, GEMMA, end, EMBEDDING if EMBEDDING in checkpoint.tensors else LM_HEAD),
+    ]
+
+
+def weights(family: Family, s: Sizes, checkpoint: Checkpoint) -> Rows:
+    d = s.d_expert
+    return [
+        *paligemma(s, checkpoint, "cache"),
         *linear("action_in", ROOT + "action_in_proj", d, s.d_action),
         *(linear("state_in", ROOT + "state_proj", d, s.d_state) if family.state_token else []),
         *_time(family, s),
