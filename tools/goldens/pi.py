@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import lerobot_layout as layout
-from .cases import Case, copy_tokenizer
+from .cases import RECORDED, Case, copy_tokenizer
 from .draw import bfloat16
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import decoder_layer, linear, parameter, rms_norm, siglip, statistics, tower
 from .recorder import ChunkRecorder
 
-NAMES = {"pi0": "lerobot.policies.pi0.PI0Policy", "pi05": "lerobot.policies.pi05.PI05Policy"}
+NAMES = {"pi0": "lerobot.policies.pi0.PI0Policy", "pi05": "lerobot.policies.pi05.PI05Policy", "pi0_fast": "lerobot.policies.pi0_fast.PI0FastPolicy"}
 HUB_TOKENIZER = "google/paligemma-3b-pt-224"
 N_TOKEN = 410  # of the tokenizer
 PATCH = 14
@@ -199,7 +199,7 @@ def set_sizes(arch, dims):
     """From here on this process builds towers of these sizes; everything else is the reference's code."""
     m = modeling(arch)
     if not hasattr(m, "published_names"):
-        m.published_names = (m.get_gemma_config, m.PaliGemmaForConditionalGenerationWithPiGemma, m.PiGemmaForCausalLM)
+        m.published_names = (m.get_gemma_config, m.PaliGemmaForConditionalGenerationWithPiGemma, getattr(m, "PiGemmaForCausalLM", None))
     gemma_config, backbone, expert = m.published_names
 
     def small_backbone(config):
@@ -267,16 +267,22 @@ def read_weights(policy, file):
 
 def load(checkpoint, dtype="float32"):
     """(policy, preprocessor, postprocessor) of a folder in the hub layout; published: the class's own bfloat16 mix."""
+    return load_sized(Path(checkpoint), dtype, {}, {})
+
+
+def load_sized(folder, dtype, own, overrides):
+    """own: fields of the configuration that name folders of this machine.  overrides: of further steps of the preprocessor."""
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import make_pre_post_processors
 
-    folder = Path(checkpoint)
     config = PreTrainedConfig.from_pretrained(str(folder))
     config.dtype = "bfloat16" if dtype == "published" else "float32"
+    for name, value in own.items():
+        setattr(config, name, value)
     policy = construct(config, json.loads((folder / "dims.json").read_text()))
     read_weights(policy, folder / "model.safetensors")
-    tokenizer = {"tokenizer_processor": {"tokenizer_name": str(folder / "tokenizer")}}
-    before, after = make_pre_post_processors(config, pretrained_path=str(folder), preprocessor_overrides=tokenizer)
+    overrides = {"tokenizer_processor": {"tokenizer_name": str(folder / "tokenizer")}, **overrides}
+    before, after = make_pre_post_processors(config, pretrained_path=str(folder), preprocessor_overrides=overrides)
     return policy.eval(), before, after
 
 
