@@ -195,7 +195,7 @@ Result<std::string> Engine::program_text(Part part) {
 Result<StagePredictions> Engine::predict() {
   if (!dry_) return StagePredictions();  // running it overwrites the working memory
   VLA_TRY(const Plan* plan, plans_->for_shape(robot().network(), robot().largest_shape()));
-  return plan->predict(robot().solver().n_step);
+  return plan->predict(robot().solver().n_run());
 }
 
 Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise,
@@ -239,17 +239,20 @@ Status Engine::warm_up(const ActShape& act) noexcept try {
   VLA_TRY(Plan * plan, plans_->for_shape(of->network(), act.inputs));
   set_inputs(*plan, zeros);
   std::vector<Tap> taps;
-  VLA_CHECK(solve(*plan, of->solver().n_step, taps));
-  static_cast<void>(plan->x());  // waits
+  const Solver& solver = of->solver();
+  VLA_CHECK(solve(*plan, solver.decodes ? 1 : solver.n_step, taps));  // of tokens, each costs the same
+  static_cast<void>(plan->x());                                       // waits
   return device_->failure();
 } catch (const std::bad_alloc&) {
   return no_memory();
 }
 
-/// Prefix and steps of what was set.
-Status Engine::solve(Plan& plan, int n_step, std::vector<Tap>& taps) {
+/// Prefix and at most `most` steps of what was set.
+Status Engine::solve(Plan& plan, int most, std::vector<Tap>& taps) {
   VLA_CHECK(plan.run_prefix(taps));
-  for (int k = 0; k < n_step; ++k) {
+  for (int k = 0; k < most; ++k) {
+    VLA_TRY(const bool needed, plan.needs_step(k));
+    if (!needed) break;
     VLA_CHECK(plan.run_step(k));
     plan.collect_step_taps(k, taps);
   }
@@ -279,6 +282,7 @@ Result<ActionChunk> Engine::run(EncodedObservation& encoded) {
   VLA_CHECK(solve(*plan, robot.solver().n_step, taps));
   const std::vector<float> x = plan->x();  // other devices than the CPU are waited for here
   VLA_CHECK(device_->failure());
+  if (robot.solver().decodes) record(taps, "tokens_out", {static_cast<std::int64_t>(x.size())}, x);
   encoded.pixels_ahead.reset();
   for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(timing, stage.name, stage.done);
   clock.lap(timing, "prefix", plan->prefix_ended());
@@ -295,7 +299,7 @@ Result<ActionChunk> Engine::run(EncodedObservation& encoded) {
 
 StageWork Engine::work() const {
   const Plan* plan = last_ ? plans_->find(last_->first->network(), last_->second) : nullptr;
-  return plan != nullptr ? plan->work(last_->first->solver().n_step) : StageWork();
+  return plan != nullptr ? plan->work(last_->first->solver().n_run()) : StageWork();
 }
 
 bool Engine::has_ternary() const {

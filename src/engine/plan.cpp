@@ -4,6 +4,9 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
+#include <cmath>
+
 #include "nn/tokens.h"
 
 namespace vla {
@@ -36,13 +39,15 @@ Plan::Plan(const Network& network, const InputShape& shape, const PlanContext& c
       images_(shape.n_view > 0 ? slots_.add_f32({shape.width, shape.height, 3, shape.n_view}) : nullptr),
       tokens_(shape.n_text > 0 ? slots_.add_i32({shape.n_text, 1, 1, 1}) : nullptr),
       state_(shape.d_state > 0 ? slots_.add_f32({shape.d_state, 1, 1, 1}) : nullptr),
-      x_(slots_.add_f32({network.d_action, network.horizon, 1, 1})),
+      x_(network.solver.decodes ? nullptr : slots_.add_f32({network.d_action, network.horizon, 1, 1})),
+      token_(network.solver.decodes ? slots_.add_i32({1, 1, 1, 1}) : nullptr),
       k_(slots_.add_i32({1, 1, 1, 1})),
       noise_(network.solver.rereads_noise() ? slots_.add_f32({count(x_->shape), network.solver.n_noise(), 1, 1})
                                             : nullptr),
       target_(shape.steered ? slots_.add_f32(x_->shape) : nullptr),
       keep_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
       pull_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
+      solver_(network.solver),
       views_(shape.views),
       text_(shape.text),
       cache_(network.constants),
@@ -67,21 +72,17 @@ TapVisitor Plan::visitor_of_steps(const TapVisitor& see) const {
 
 Status Plan::lower(const Network& network, const PlanContext& context) {
   Graph prefix(slots_, prefix_filter(tap_pattern_), injection_.of_prefix());
-  Graph step(slots_, step_filter(tap_pattern_, network.solver.n_step), injection_.of_step(network.solver.n_step));
+  Graph step(slots_, step_filter(tap_pattern_, network.solver.n_step), injection_.of_step(network.solver.n_run()));
   const auto input = [&](const Slot* slot) { return slot != nullptr ? prefix.input(slot) : Tensor(); };
   network.policy.prefix(prefix, {input(images_), input(tokens_), input(state_), views_, text_}, cache_);
-  const Tensor x = step.input(x_), k = step.input(k_);
-  const Tensor condition = network.conditions != nullptr ? column(step, step.input(network.conditions), k) : Tensor();
-  Tensor answer = network.policy.velocity(step, x, condition, cache_);
-  LowerOptions changing = {{x_, k_}, visitor_of_steps(context.see_tap)};
-  if (target_ != nullptr) {
-    answer = steered(step, x, k, answer);
-    changing.varying.insert(changing.varying.end(), {target_, keep_, pull_});
-  }
-  const Tensor noise = noise_ != nullptr ? step.input(noise_) : Tensor();
-  step.write(step.name("x", network.solver.next(step, x, answer, noise, k)), x_);
+  LowerOptions changing = {{k_}, visitor_of_steps(context.see_tap)};
+  if (token_ != nullptr)
+    record_decoder(step, network, changing);
+  else
+    record_solver(step, network, changing);
   // The device counts, so nothing is uploaded between steps.
-  if (condition || target_ != nullptr || network.solver.counts()) step.write(network.solver.after(step, k), k_);
+  if (network.conditions != nullptr || target_ != nullptr || solver_.counts())
+    step.write(solver_.after(step, step.input(k_)), k_);
 
   if (context.see_graph)
     for (const Graph* graph : {&prefix, &step}) context.see_graph(*graph);
@@ -94,6 +95,29 @@ Status Plan::lower(const Network& network, const PlanContext& context) {
   VLA_TRY(prefix_, device_.lower(prefix, varying));
   VLA_TRY(step_, device_.lower(step, changing));
   return context.dry ? Status() : prefix_->prepare();
+}
+
+void Plan::record_solver(Graph& step, const Network& network, LowerOptions& changing) const {
+  const Tensor x = step.input(x_), k = step.input(k_);
+  const Tensor condition = network.conditions != nullptr ? column(step, step.input(network.conditions), k) : Tensor();
+  Tensor answer = network.policy.velocity(step, x, condition, cache_);
+  changing.varying.push_back(x_);
+  if (target_ != nullptr) {
+    answer = steered(step, x, k, answer);
+    changing.varying.insert(changing.varying.end(), {target_, keep_, pull_});
+  }
+  const Tensor noise = noise_ != nullptr ? step.input(noise_) : Tensor();
+  step.write(step.name("x", solver_.next(step, x, answer, noise, k)), x_);
+}
+
+/// Prefix and step leave their logits in the same slot, and the step's own keys and values stay where it finds them.
+void Plan::record_decoder(Graph& step, const Network& network, LowerOptions& changing) {
+  logits_ = cache_.slot("logits");
+  const Tensor logits =
+      network.policy.decode(step, step.input(token_), step.input(k_), std::max(1, solver_.n_run()), cache_);
+  step.write(step.name("logits", logits), logits_);
+  changing.varying.push_back(token_);
+  changing.varying.insert(changing.varying.end(), cache_.appended().begin(), cache_.appended().end());
 }
 
 Result<std::unique_ptr<Plan>> Plan::build(const Network& network, const InputShape& shape, const PlanContext& context) {
@@ -115,9 +139,15 @@ void Plan::set_inputs(std::span<const float> pixels, const Device::Sent* ahead, 
 
 void Plan::set_noise(std::span<const float> noise) {
   constexpr std::int32_t kFirst = 0;
+  device_.set(*k_, &kFirst, sizeof(kFirst));
+  decoded_.clear();
+  for (const Slot* slot : cache_.appended()) {
+    const std::vector<float> zeros(static_cast<std::size_t>(count(slot->shape)));
+    device_.set(*slot, zeros.data(), slot->size());
+  }
+  if (x_ == nullptr) return;
   const std::span<const float> start = noise.first(static_cast<std::size_t>(count(x_->shape)));
   device_.set(*x_, start.data(), start.size_bytes());
-  device_.set(*k_, &kFirst, sizeof(kFirst));
   if (noise_ != nullptr) device_.set(*noise_, noise.data(), noise.size_bytes());
 }
 
@@ -135,6 +165,18 @@ Status Plan::run_prefix(std::vector<Tap>& taps) {
   VLA_CHECK(step_->prepare());  // in the prefix's working memory
   prefix_ended_ = std::chrono::steady_clock::now();
   return {};
+}
+
+Result<bool> Plan::needs_step(int k) {
+  if (token_ == nullptr) return k < solver_.n_step;
+  const std::vector<float> logits = device_.get(*logits_);
+  VLA_CHECK(device_.failure());
+  if (!std::ranges::all_of(logits, [](float x) { return std::isfinite(x); }))
+    return Error{Code::bad_action, fmt::format("token {}", k), "finite logits", "one that is not"};
+  const auto likeliest = static_cast<std::int32_t>(std::ranges::max_element(logits) - logits.begin());
+  decoded_.push_back(static_cast<float>(likeliest));
+  device_.set(*token_, &likeliest, sizeof(likeliest));
+  return likeliest != solver_.stop_token && k < solver_.n_run();
 }
 
 Status Plan::run_step(int k) {

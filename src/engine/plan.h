@@ -52,13 +52,17 @@ class Plan {
                   std::span<const float> state);
   /// Sets the start of the first step, and what is drawn for steps behind it.
   void set_noise(std::span<const float> noise);
-  std::vector<float> x() const { return device_.get(*x_); }
+  /// The network's answer: x, or the tokens that were decoded.
+  std::vector<float> x() const { return token_ != nullptr ? decoded_ : device_.get(*x_); }
   /// Sets the steering, for a shape with a leftover.
   void set_steering(const Steering& steering);
 
   /// Runs the prefix, which fills the cache, appends its taps, and computes what the steps need of the cache only.
   Status run_prefix(std::vector<Tap>& taps);
-  /// Runs solver step k after step k - 1: x <- the solver's next x.
+  /// Whether the act needs step k, after step k - 1 or the prefix. Of a policy that decodes, this reads the next token.
+  /// Errors: bad_action for logits that are not finite.
+  Result<bool> needs_step(int k);
+  /// Runs step k after step k - 1: x <- the solver's next x, or the logits after the last token.
   Status run_step(int k);
 
   /// The stages that the policy's prefix names, with the last run's times. Read x first.
@@ -83,6 +87,8 @@ class Plan {
  private:
   Plan(const Network& network, const InputShape& shape, const PlanContext& context);
   Status lower(const Network& network, const PlanContext& context);
+  void record_solver(Graph& step, const Network& network, LowerOptions& changing) const;
+  void record_decoder(Graph& step, const Network& network, LowerOptions& changing);
   TapVisitor visitor_of_steps(const TapVisitor& see) const;
   Tensor steered(Graph& step, Tensor x, Tensor k, Tensor velocity) const;
 
@@ -90,9 +96,12 @@ class Plan {
   Device& device_;
   Slots slots_;
   // The inputs of an act, side by side in the order in which the act sets them, so that one upload sends them all.
-  // Images, tokens and state may be null. `noise` is null unless steps read it; the last three are null without a
-  // leftover.
-  Slot *images_, *tokens_, *state_, *x_, *k_, *noise_, *target_, *keep_, *pull_;
+  // Images, tokens and state may be null. `x` is null where tokens are decoded, `token` where none are. `noise` is null
+  // unless steps read it; the last three are null without a leftover.
+  Slot *images_, *tokens_, *state_, *x_, *token_, *k_, *noise_, *target_, *keep_, *pull_;
+  Slot* logits_ = nullptr;
+  const Solver& solver_;
+  std::vector<float> decoded_;  // tokens of this act
   std::uint64_t views_;
   TextLayout text_;
   Cache cache_;

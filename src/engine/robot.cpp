@@ -53,6 +53,9 @@ Status Robot::read_policy() {
   VLA_TRY(horizon_, keys.integer("policy.horizon", {1, kMaxHorizon}));
   VLA_TRY(d_action_, keys.integer("policy.d_action", {1, kMaxVector}));
   VLA_TRY(d_state_, keys.integer("policy.d_state", {0, kMaxVector}));
+  if (solver_.decodes != processor_.action_tokens().has_value())
+    return Error{Code::bad_bundle, "action_tokens.kind", "one where solver.kind is greedy, and only there",
+                 solver_.decodes ? "none" : "one"};
   return policy_->check(largest_shape());
 }
 
@@ -190,8 +193,17 @@ Status Robot::check_leftover(const Observation& observation, const Leftover& lef
   return {};
 }
 
-Result<ActionChunk> Robot::decode(const std::vector<float>& x, const Inputs& inputs) const {
+/// The chunk, normalized, that the network's answer stands for.
+Result<std::vector<float>> Robot::normalized_chunk(const std::vector<float>& answer, std::string& note) const {
+  if (!processor_.action_tokens()) return answer;
+  const std::vector<std::int32_t> ids(answer.begin(), answer.end());
+  return processor_.action_tokens()->decode(ids, horizon_, d_action_, &note);
+}
+
+Result<ActionChunk> Robot::decode(const std::vector<float>& answer, const Inputs& inputs) const {
   ActionChunk chunk;
+  std::string note;
+  VLA_TRY(const std::vector<float> x, normalized_chunk(answer, note));
   VLA_TRY(chunk.actions, processor_.decode(x, horizon_, d_action_, inputs.raw_state));
   const ChunkShape shape = chunk_shape();
   chunk.horizon = shape.n_row, chunk.d_action = shape.d_normalized;
@@ -199,6 +211,7 @@ Result<ActionChunk> Robot::decode(const std::vector<float>& x, const Inputs& inp
     chunk.normalized.insert(chunk.normalized.end(), x.begin() + row * d_action_,
                             x.begin() + row * d_action_ + shape.d_normalized);
   chunk.notes = inputs.notes;
+  if (!note.empty()) chunk.notes.push_back(note);
   if (const std::optional<std::string> far = processor_.far_action(chunk.normalized))
     chunk.notes.push_back(fmt::format("actions{}; more than {} is far from the training data", *far, kStateBound));
   chunk.out_of_range = inputs.out_of_range;

@@ -70,9 +70,9 @@ class Robot {
                 EncodedObservation& to) const;
   /// The same of zeros, of this size. Errors: bad_observation where no observation has it.
   Result<EncodedObservation> zeros(const InputShape& shape) const;
-  /// Turns the network's answer, (solver_horizon, d_action_padded), into the robot's rows and columns, with notes.
-  /// Errors: bad_action.
-  Result<ActionChunk> decode(const std::vector<float>& x, const Inputs& inputs) const;
+  /// Turns the network's answer, (solver_horizon, d_action_padded) or tokens, into the robot's rows and columns, with
+  /// notes. Errors: bad_action.
+  Result<ActionChunk> decode(const std::vector<float>& answer, const Inputs& inputs) const;
 
   const Bundle& bundle() const { return bundle_; }
   const Processor& processor() const { return processor_; }
@@ -101,7 +101,7 @@ class Robot {
   ChunkShape chunk_shape() const;
   std::uint64_t view_key(std::uint64_t views) const;
   Result<std::vector<float>> values_of(const Noise& noise) const;
-  std::vector<float> normalized(const std::vector<float>& x) const;
+  Result<std::vector<float>> normalized_chunk(const std::vector<float>& answer, std::string& note) const;
 
   Bundle bundle_;
   Processor processor_;

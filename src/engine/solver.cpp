@@ -29,13 +29,17 @@ Result<Solver> Solver::read(const Keys& keys) {
   Solver solver;
   VLA_TRY(const std::string kind, keys.string("solver.kind"));
   const bool denoises = kind == "ddpm" || kind == "ddim";
-  VLA_CHECK(expect(denoises || kind == "euler" || kind == "euler_float32" || kind == "direct" || kind == "renoise",
-                   "solver.kind", "euler, euler_float32, direct, renoise, ddpm or ddim", kind));
-  solver.direct = kind == "direct", solver.renoises = kind == "renoise";
+  solver.direct = kind == "direct", solver.renoises = kind == "renoise", solver.decodes = kind == "greedy";
+  VLA_CHECK(expect(
+      denoises || solver.direct || solver.renoises || solver.decodes || kind == "euler" || kind == "euler_float32",
+      "solver.kind", "euler, euler_float32, direct, renoise, ddpm, ddim or greedy", kind));
   VLA_TRY(solver.n_step, keys.integer("solver.steps", {1, solver.direct ? 1.0 : 1000.0}));
   VLA_TRY(solver.noise, keys.string("solver.noise"));
-  if (solver.direct) {
+  if (solver.direct || solver.decodes) {
     VLA_CHECK(expect(solver.noise == "none", "solver.noise", "none", solver.noise));
+    if (solver.decodes) {
+      VLA_TRY(solver.stop_token, keys.integer("solver.stop_token", {0, 1 << 24}));
+    }
     solver.times.push_back({0.0f, 0.0});
     return solver;
   }

@@ -18,11 +18,15 @@ namespace vla {
 ///   direct                one pass: x <- what the network gives, from a start of zeros
 ///   ddpm, ddim            as the scheduler of this name (engine/diffusion_schedule.h); ddpm draws noise in every step
 ///                         but the last
+///   greedy                no field to integrate: the network answers tokens one by one, each the likeliest after those
+///                         before it, up to `steps` of them or the stop token
 ///   renoise               the network gives actions: x <- t * start + (1 - t) * actions, where t is the next step's
 ///                         time, from 1 to 0 (lerobot policies/xvla/modeling_xvla.py generate_actions)
 struct Solver {
   int n_step = 0;
   bool direct = false, renoises = false;
+  bool decodes = false;          // `greedy`
+  std::int32_t stop_token = -1;  // of `greedy`
   double t_end = 0;
   float dt = 0;  // (t_end - t_start) / n_step, computed in double and rounded once, as in the reference
   /// t_k; t_end is never evaluated. `euler`: t_start + k * dt in double, rounded once, as in LeRobot. `euler_float32`:
@@ -35,7 +39,9 @@ struct Solver {
   /// How many chunks of noise an act has: the start, then one for each step that draws.
   int n_noise() const { return diffusion && diffusion->draws ? n_step : 1; }
   /// Whether steps differ by their number.
-  bool counts() const { return renoises || diffusion.has_value(); }
+  bool counts() const { return renoises || decodes || diffusion.has_value(); }
+  /// Runs of the step's graph in an act, at most: the first token comes from the prefix.
+  int n_run() const { return decodes ? n_step - 1 : n_step; }
   /// Whether steps read the act's noise.
   bool rereads_noise() const { return renoises || n_noise() > 1; }
 

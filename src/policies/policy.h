@@ -86,7 +86,19 @@ class Policy {
   virtual void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const = 0;
 
   /// Step rate: the velocity at x_t, [d_action, horizon] -> the same shape. `condition` is this step's column, [d, 1].
-  virtual Tensor velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const = 0;
+  /// Only a policy with another solver than `greedy` has one.
+  virtual Tensor velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const {
+    static_cast<void>(g), static_cast<void>(x_t), static_cast<void>(condition), static_cast<void>(cache);
+    return {};
+  }
+
+  /// Step rate of `greedy`: logits [n_vocab] of what follows `token` [1] i32, which is the k-th ([1] i32, from 0) of at
+  /// most `n_token` that are read. The prefix puts the logits of the first token into the cache, as `logits`.
+  virtual Tensor decode(Graph& g, Tensor token, Tensor k, int n_token, Cache& cache) const {
+    static_cast<void>(g), static_cast<void>(token), static_cast<void>(k), static_cast<void>(n_token);
+    static_cast<void>(cache);
+    return {};
+  }
 };
 
 /// Checks that memory can hold a prefix of `n_view` views of `n_token` tokens each and `n_other` other tokens. Errors:

@@ -27,34 +27,48 @@ class DecoderBlock : public Module<DecoderBlock> {
   DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps);
   /// x [d_model, n], rotary [d_head, n], mask [n, n] or none -> the shape of x.
   Tensor forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Cache& cache) const;
+  /// The same for one token [d_model, 1] behind a prefix in the cache. Its keys and values are appended there; `mask`
+  /// [n_prefix + capacity, 1] hides the places after it.
+  Tensor next(Graph& g, Tensor x, Tensor rotary, Tensor mask, const AppendPlace& place, Cache& cache) const;
 
  private:
+  Tensor rest(Graph& g, Tensor x, Tensor h, Tensor rotary, const std::vector<KeyValue>& segments, Tensor mask) const;
+
   RmsNorm attn_norm_;
   Attention attention_;
   RmsNorm ffn_norm_;
   GatedMlp mlp_;
 };
 
+/// What a policy reads of a language model: keys and values of a prefix, or logits of the token that comes next.
+enum class DecoderOutput { keys_and_values, logits };
+
 /// A language model of the Llama or Gemma family as a policy uses it: it embeds tokens and computes keys and values of
-/// a prefix, layer by layer. The last layer's output is not read, so that layer stops at its keys and values.
+/// a prefix, layer by layer. Where nobody reads logits, the last layer stops at its keys and values, and there are no
+/// `norm` and `head`.
 class Decoder {
  public:
-  Decoder(const Scope& s, DecoderFamily family);
+  Decoder(const Scope& s, DecoderFamily family, DecoderOutput output = DecoderOutput::keys_and_values);
 
   /// tokens [n] i32 -> [d_model, n], not scaled.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_(g, tokens); }
   /// x [d_model, n], mask [n, n] or none for full attention -> cache `<path>.blk.<i>.{k,v}`, each [d_head, n_head_kv,
-  /// n].
+  /// n], and `logits` [n_vocab] of the token after the last one.
   void prefill(Graph& g, Tensor x, Tensor mask, Cache& cache) const;
+
+  /// Logits after token k ([1] i32) of at most `n_token` behind the prefix: x [d_model, 1] -> [n_vocab, 1]. Keys and
+  /// values of the tokens before it are in the cache.
+  Tensor next(Graph& g, Tensor x, Tensor k, int n_token, Cache& cache) const;
 
   /// The cached keys and values of layer i.
   KeyValue cached(Graph& g, const Cache& cache, int i_layer) const;
   int d_model() const { return d_model_; }
-  int n_layer() const { return static_cast<int>(blocks_.size()) + 1; }
+  int n_layer() const { return static_cast<int>(blocks_.size()) + (last_kv_ ? 1 : 0); }
   const Heads& heads() const { return heads_; }
 
  private:
   std::string layer_path(int i_layer) const;
+  Tensor logits(Graph& g, Tensor x) const;
 
   std::string path_;
   int d_model_;
@@ -63,6 +77,8 @@ class Decoder {
   std::vector<DecoderBlock> blocks_;
   std::optional<RmsNorm> last_norm_;
   std::optional<KeyValueProjection> last_kv_;
+  std::optional<RmsNorm> norm_;
+  std::optional<Linear> head_;
 };
 
 }  // namespace vla

@@ -6,19 +6,17 @@
 
 namespace vla {
 
-PaliGemma::PaliGemma(const Scope& s)
+PaliGemma::PaliGemma(const Scope& s, DecoderOutput output)
     : vision_(s / "vision"),
-      lm_(s / "lm", kGemma),
+      lm_(s / "lm", kGemma, output),
       projector_(s / "projector", vision_.d_model(), lm_.d_model(), Bias::yes),
       text_scale_(s.number("text_scale", kTokenScale)) {}
 
 void PaliGemma::prefill(Graph& g, Tensor images, Tensor tokens, Cache& cache) const {
-  // Scales only the embedded text: Gemma was trained with sqrt(d_model) on embeddings, the projector without it.
   const Tensor view = projector_(g, vision_(g, images));  // [d_model, n_token, n_view]
   g.end_stage("vision");
-  const Tensor image = flatten_views(g, view);                      // [d_model, n_token * n_view]
-  const Tensor text = scale(g, lm_.embed(g, tokens), text_scale_);  // [d_model, n_text]
-  lm_.prefill(g, g.name("prefix", concat_tokens(g, {image, text})), {}, cache);
+  const Tensor image = flatten_views(g, view);  // [d_model, n_token * n_view]
+  lm_.prefill(g, g.name("prefix", concat_tokens(g, {image, embed(g, tokens)})), {}, cache);
 }
 
 Keys PaliGemma::published(std::map<std::string, Value, std::less<>> policy) {

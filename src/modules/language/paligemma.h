@@ -4,6 +4,7 @@
 
 #include "modules/language/decoder.h"
 #include "modules/vision/siglip.h"
+#include "nn/tokens.h"
 
 namespace vla {
 
@@ -13,7 +14,7 @@ namespace vla {
 class PaliGemma {
  public:
   /// `s` is the root of the tree.
-  explicit PaliGemma(const Scope& s);
+  explicit PaliGemma(const Scope& s, DecoderOutput output = DecoderOutput::keys_and_values);
 
   /// Checks that images have the tower's size. Errors: bad_bundle, unsupported.
   Status check(int width, int height) const { return vision_.check(width, height); }
@@ -21,8 +22,13 @@ class PaliGemma {
   int n_token(int width) const { return (width / vision_.patch_size()) * (width / vision_.patch_size()); }
   /// images [width, height, 3, n_view], tokens [n_text] i32 -> cache `lm.blk.<i>.{k,v}` of n_view * n_token + n_text
   /// tokens with full attention. The reference masks absent views and padding, which do not advance positions, so
-  /// leaving them out changes nothing.
+  /// leaving them out changes nothing. Where the language model answers tokens, also `logits` of the first.
   void prefill(Graph& g, Tensor images, Tensor tokens, Cache& cache) const;
+
+  /// Decoder::next of `token` [1] i32.
+  Tensor next(Graph& g, Tensor token, Tensor k, int n_token, Cache& cache) const {
+    return lm_.next(g, embed(g, token), k, n_token, cache);
+  }
 
   const Decoder& lm() const { return lm_; }
 
@@ -31,6 +37,9 @@ class PaliGemma {
   static Keys published(std::map<std::string, Value, std::less<>> policy);
 
  private:
+  /// Scales only the embedded text: Gemma was trained with sqrt(d_model) on embeddings, the projector without it.
+  Tensor embed(Graph& g, Tensor tokens) const { return scale(g, lm_.embed(g, tokens), text_scale_); }
+
   Siglip vision_;
   Decoder lm_;
   Linear projector_;
