@@ -1,0 +1,38 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include "modules/encoder_block.h"
+#include "nn/embedding.h"
+
+namespace vla {
+
+/// DINOv2's vision transformer, all views in one batch, as far as the block whose patches a policy reads. A class token
+/// and registers precede the patches, have no position, and are dropped at the end. Source: timm vision_transformer.py
+/// VisionTransformer (reg_tokens, no_embed_class), get_intermediate_layers.
+class DinoV2 {
+ public:
+  explicit DinoV2(const Scope& s);
+
+  /// images [side, side, 3, n_view], standardized -> [d_model, n_patch, n_view]. `check` must have accepted the size.
+  Tensor operator()(Graph& g, Tensor images) const;
+  /// Checks that images have the size of the keys. Errors: unsupported.
+  Status check(int width, int height) const;
+
+  int d_model() const { return d_model_; }
+  /// Patches of a view.
+  int n_patch() const { return n_side_ * n_side_; }
+
+ private:
+  int d_model_, image_size_, n_side_, n_register_;
+  const Param* class_token_;
+  PatchEmbed patch_embed_;
+  Embedding position_;
+  std::optional<Embedding> registers_;
+  std::vector<EncoderBlock> blocks_;
+};
+
+}  // namespace vla
