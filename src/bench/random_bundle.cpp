@@ -55,9 +55,10 @@ struct ImageSize {
 /// Errors: bad_bundle.
 Result<ImageSize> image_size(const Keys& keys) {
   const bool two_sides = keys.has("vision.image_width");
+  const char* side = keys.has("dino.image_size") ? "dino.image_size" : "vision.image_size";
   ImageSize size;
-  VLA_TRY(size.width, keys.integer(two_sides ? "vision.image_width" : "vision.image_size", kAnySize));
-  VLA_TRY(size.height, keys.integer(two_sides ? "vision.image_height" : "vision.image_size", kAnySize));
+  VLA_TRY(size.width, keys.integer(two_sides ? "vision.image_width" : side, kAnySize));
+  VLA_TRY(size.height, keys.integer(two_sides ? "vision.image_height" : side, kAnySize));
   return size;
 }
 
@@ -126,6 +127,18 @@ std::string added_token(std::string_view content, std::size_t id) {
   return nlohmann::ordered_json::array({token}).dump();
 }
 
+/// Of a policy that decodes: every sequence of tokens stands for a chunk.
+void add_action_tokens(Keys& keys) {
+  const Keys added({{"action_tokens.kind", "fast"},
+                    {"action_tokens.vocab", std::vector<std::string>{"a"}},
+                    {"action_tokens.min_token", 0.0},
+                    {"action_tokens.scale", 1.0},
+                    {"action_tokens.first_id", std::int64_t{0}},
+                    {"action_tokens.prefix_ids", std::vector<std::int64_t>{0}},
+                    {"action_tokens.required_ids", std::vector<std::int64_t>()}});
+  for (const auto& [key, value] : added.all()) keys.set(key, value);
+}
+
 Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
   VLA_TRY(const ImageSize image, image_size(keys));
   VLA_TRY(const int d_state, keys.integer("policy.d_state", kAnySize));
@@ -179,6 +192,7 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
   });
   for (const auto& [key, value] : added.all())
     if (!keys.has(key)) keys.set(key, value);
+  if (*keys.string("solver.kind") == "greedy") add_action_tokens(keys);
   if (places.count > 0) keys.set(places.behind ? ViewPlaces::kStartsFromEnd : ViewPlaces::kStarts, places.starts());
   return {};
 }
