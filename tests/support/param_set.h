@@ -22,8 +22,9 @@ class ParamSet {
     DType type = DType::f32;
   };
 
-  explicit ParamSet(const std::vector<Piece>& pieces) {
+  explicit ParamSet(const std::vector<Piece>& pieces, const Keys& keys = {}) {
     EditableBundle bundle;
+    for (const auto& [key, value] : keys.all()) bundle.set(key, value);
     for (const char* key : {"vla.arch", "vla.source.name", "vla.source.revision", "vla.source.converter"})
       bundle.set(key, Value(std::string("test")));
     bundle.set("vla.dtype", Value(std::string("f32")));
