@@ -11,7 +11,7 @@
 namespace vla {
 namespace {
 
-constexpr const char* kWhere = "tokenizer.added";
+constexpr const char* kAddedKey = "tokenizer.added";
 constexpr std::size_t kMaxContent = 256;  // bytes; limits the work at each position of the text
 
 Result<AddedToken> parse_added_token(const Json& item, std::string where, int n_vocab) {
@@ -30,11 +30,9 @@ Result<AddedToken> parse_added_token(const Json& item, std::string where, int n_
   return token;
 }
 
-bool is(std::uint32_t code_point, unicode::Class wanted) { return (unicode::classes(code_point) & wanted) != 0; }
-
 bool stands_alone(std::string_view before, std::string_view after) {
-  const bool left = before.empty() || !is(unicode::last(before).code_point, unicode::kWord);
-  const bool right = after.empty() || !is(unicode::first(after).code_point, unicode::kWord);
+  const bool left = before.empty() || !unicode::is(unicode::last(before).code_point, unicode::kWord);
+  const bool right = after.empty() || !unicode::is(unicode::first(after).code_point, unicode::kWord);
   return left && right;
 }
 
@@ -43,7 +41,7 @@ std::size_t trailing_space(std::string_view text) {
   std::size_t size = 0;
   while (size < text.size()) {
     const unicode::Char c = unicode::last(text.substr(0, text.size() - size));
-    if (!is(c.code_point, unicode::kSpace)) break;
+    if (!unicode::is(c.code_point, unicode::kSpace)) break;
     size += c.size;
   }
   return size;
@@ -53,7 +51,7 @@ std::size_t leading_space(std::string_view text) {
   std::size_t size = 0;
   while (size < text.size()) {
     const unicode::Char c = unicode::first(text.substr(size));
-    if (!is(c.code_point, unicode::kSpace)) break;
+    if (!unicode::is(c.code_point, unicode::kSpace)) break;
     size += c.size;
   }
   return size;
@@ -62,12 +60,12 @@ std::size_t leading_space(std::string_view text) {
 }  // namespace
 
 Result<std::vector<AddedToken>> parse_added_tokens(const std::string& json, int n_vocab) {
-  VLA_TRY(const Json list, parse_json_list(json, kWhere));
+  VLA_TRY(const Json list, parse_json_list(json, kAddedKey));
   std::vector<AddedToken> tokens;
   std::set<std::int32_t> ids;
   std::set<std::string> contents;
   for (const Json& item : list) {
-    const std::string where = std::string(kWhere) + "[" + std::to_string(tokens.size()) + "]";
+    const std::string where = std::string(kAddedKey) + "[" + std::to_string(tokens.size()) + "]";
     VLA_TRY(AddedToken token, parse_added_token(item, where, n_vocab));
     if (token.id != kNoRow && !ids.insert(token.id).second)
       return Error{Code::bad_bundle, where + ".id", "one added token per id", std::to_string(token.id) + " again"};

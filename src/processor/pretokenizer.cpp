@@ -10,7 +10,7 @@
 namespace vla {
 namespace {
 
-constexpr const char* kWhere = "tokenizer.pre";
+constexpr const char* kPreKey = "tokenizer.pre";
 constexpr std::size_t kMaxSteps = 8;  // no real tokenizer has more than two
 constexpr std::uint8_t kLetterNumberSpace = unicode::kLetter | unicode::kNumber | unicode::kSpace;
 
@@ -132,14 +132,14 @@ std::size_t qwen2_word(std::string_view text) { return word_of(text, 1); }
 std::size_t llama3_word(std::string_view text) { return word_of(text, 3); }
 
 Result<Pretokenizer> Pretokenizer::parse(const std::string& json) {
-  VLA_TRY(const Json list, parse_json_list(json, kWhere));
+  VLA_TRY(const Json list, parse_json_list(json, kPreKey));
   if (list.size() > kMaxSteps)
-    return Error{Code::bad_bundle, kWhere, "at most " + std::to_string(kMaxSteps) + " steps",
+    return Error{Code::bad_bundle, kPreKey, "at most " + std::to_string(kMaxSteps) + " steps",
                  std::to_string(list.size())};
   Pretokenizer pretokenizer;
   bool closed = false;
   for (std::size_t i = 0; i < list.size(); ++i) {
-    const std::string where = std::string(kWhere) + "[" + std::to_string(i) + "]";
+    const std::string where = std::string(kPreKey) + "[" + std::to_string(i) + "]";
     if (closed) return Error{Code::bad_bundle, where, "nothing after byte_level", "another step"};
     VLA_TRY(JsonFields fields, JsonFields::open(list[i], where));
     VLA_TRY(const int type, fields.choice("type", {"digits", "split", "byte_level"}));
@@ -156,7 +156,7 @@ Result<Pretokenizer> Pretokenizer::parse(const std::string& json) {
     }
     VLA_CHECK(fields.done());
   }
-  if (!closed) return Error{Code::bad_bundle, kWhere, "a last step of type byte_level", "none"};
+  if (!closed) return Error{Code::bad_bundle, kPreKey, "a last step of type byte_level", "none"};
   return pretokenizer;
 }
 

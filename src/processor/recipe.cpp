@@ -20,7 +20,7 @@
 namespace vla {
 namespace {
 
-constexpr const char* kWhere = "processor.recipe";
+constexpr const char* kRecipeKey = "processor.recipe";
 constexpr std::array<const char*, 4> kLists = {"image", "text", "state", "action"};
 constexpr std::size_t kMaxOps = 64;  // of one list
 
@@ -52,7 +52,7 @@ Status parse_op(const char* list, JsonFields& fields, Recipe& recipe) {
 }
 
 Status parse_list(const Json& document, const char* name, Recipe& recipe) {
-  const std::string where = std::string(kWhere) + "." + name;
+  const std::string where = std::string(kRecipeKey) + "." + name;
   const auto list = document.find(name);
   if (list == document.end())
     return Error{Code::bad_bundle, where, "a list of ops", "no such field", "convert the checkpoint again"};
@@ -69,7 +69,7 @@ Status parse_list(const Json& document, const char* name, Recipe& recipe) {
 /// Checks across lists: a discretized state without a place in the prompt would be lost silently.
 Status check_state(const Recipe& recipe) {
   if (recipe.discretizes_state == recipe.prompt_takes_state) return {};
-  return Error{Code::bad_bundle, std::string(kWhere) + ".text",
+  return Error{Code::bad_bundle, std::string(kRecipeKey) + ".text",
                recipe.discretizes_state ? "a template with {state} for the state that ends in bins"
                                         : "no {state}, or a state list that ends in bins",
                recipe.discretizes_state ? "none" : "{state}"};
@@ -96,21 +96,21 @@ struct NoImages final : Fit {
 }  // namespace
 
 Result<Recipe> parse_recipe(const std::string& json) {
-  VLA_TRY(const Json document, parse_json(json, kWhere));
-  if (!document.is_object()) return Error{Code::bad_bundle, kWhere, "a JSON object", "other text"};
+  VLA_TRY(const Json document, parse_json(json, kRecipeKey));
+  if (!document.is_object()) return Error{Code::bad_bundle, kRecipeKey, "a JSON object", "other text"};
   Recipe recipe;
   for (const char* list : kLists) VLA_CHECK(parse_list(document, list, recipe));
   for (const auto& item : document.items())
     if (std::find(kLists.begin(), kLists.end(), item.key()) == kLists.end())
-      return Error{Code::bad_bundle, std::string(kWhere) + "." + item.key(), "", "unknown field",
+      return Error{Code::bad_bundle, std::string(kRecipeKey) + "." + item.key(), "", "unknown field",
                    "this bundle needs a newer vla"};
   const auto images = document.find("image");
   if (images != document.end() && images->is_array() && images->empty())
     recipe.fit = std::make_unique<NoImages>();
   else if (recipe.width == 0)
-    return Error{Code::bad_bundle, std::string(kWhere) + ".image", "a letterbox, a resize or a size", "none"};
+    return Error{Code::bad_bundle, std::string(kRecipeKey) + ".image", "a letterbox, a resize or a size", "none"};
   if (recipe.max_tokens == 0 && !recipe.text.empty())
-    return Error{Code::bad_bundle, std::string(kWhere) + ".text", "tokenize as the last op", "none"};
+    return Error{Code::bad_bundle, std::string(kRecipeKey) + ".text", "tokenize as the last op", "none"};
   VLA_CHECK(check_state(recipe));
   return recipe;
 }

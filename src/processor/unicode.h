@@ -28,6 +28,7 @@ enum Class : std::uint16_t {
 };
 
 std::uint16_t classes(std::uint32_t code_point);
+inline bool is(std::uint32_t code_point, Class wanted) { return (classes(code_point) & wanted) != 0; }
 
 /// BERT's small letter of a character, or the character itself. U+0130, whose small letter has two characters, is
 /// decomposed before.

@@ -26,8 +26,6 @@ bool is_chinese(std::uint32_t c) {
                      [c](const Range& range) { return c >= range.first && c <= range.last; });
 }
 
-bool is(std::uint32_t code_point, unicode::Class wanted) { return (unicode::classes(code_point) & wanted) != 0; }
-
 template <class Use>
 void each_char(std::string_view text, Use use) {
   for (unicode::Char c; !text.empty(); text.remove_prefix(c.size)) {
@@ -40,8 +38,8 @@ std::string cleaned(std::string_view text) {
   std::string out;
   out.reserve(text.size());
   each_char(text, [&](std::uint32_t c, std::string_view bytes) {
-    if (is(c, unicode::kControl)) return;
-    if (is(c, unicode::kSpace)) bytes = " ";
+    if (unicode::is(c, unicode::kControl)) return;
+    if (unicode::is(c, unicode::kSpace)) bytes = " ";
     is_chinese(c) ? out.append(" ").append(bytes).append(" ") : out.append(bytes);
   });
   return out;
@@ -76,7 +74,7 @@ std::string WordPiece::normalize(std::string_view text) {
   std::string out;
   out.reserve(parts.size());
   each_char(parts, [&](std::uint32_t c, std::string_view) {
-    if (!is(c, unicode::kMark)) unicode::append(out, unicode::lower(c));
+    if (!unicode::is(c, unicode::kMark)) unicode::append(out, unicode::lower(c));
   });
   return out;
 }
@@ -87,7 +85,7 @@ void WordPiece::encode(std::string_view text, std::vector<std::int32_t>& ids) co
     if (at > start) encode_word(text.substr(start, at - start), ids);
   };
   each_char(text, [&](std::uint32_t c, std::string_view bytes) {
-    const bool is_mark = is(c, unicode::kPunctuation);
+    const bool is_mark = unicode::is(c, unicode::kPunctuation);
     if (is_mark || c == ' ') {
       end_word();
       if (is_mark) encode_word(bytes, ids);

@@ -154,7 +154,7 @@ TEST_CASE("keys of action tokens that do not fit are refused") {
     return refusal(ActionTokens::read(keys), Code::bad_bundle);
   };
   using Numbers = std::vector<std::int64_t>;
-  CHECK(contains(refused("kind", std::string("bins")), "expected fast, found bins"));
+  CHECK(contains(refused("kind", std::string("words")), "expected fast or bins, found words"));
   CHECK(contains(refused("vocab", std::vector<std::string>()), "action_tokens.vocab"));
   CHECK(contains(refused("min_token", 0.5), "a whole number, found 0.5"));
   CHECK(contains(refused("min_token", std::nan("")), "action_tokens.min_token"));
@@ -166,4 +166,22 @@ TEST_CASE("keys of action tokens that do not fit are refused") {
   Keys keys = small_keys();
   keys.set("solver.stop_token", std::int64_t{40});
   CHECK(contains(refusal(ActionTokens::read(keys), Code::bad_bundle), "solver.stop_token"));
+}
+
+TEST_CASE("a token of a bin stands for its centre, the nearest one where it names none") {
+  Keys keys({{"action_tokens.kind", "bins"},
+             {"action_tokens.n_bin", std::int64_t{5}},
+             {"action_tokens.first_id", std::int64_t{11}},
+             {"lm.n_vocab", std::int64_t{16}}});
+  const ActionTokens tokens = make(keys);
+  std::string note;
+  CHECK(decode(tokens, {11, 10, 9, 8}, 2, 2, note) == std::vector<float>{-0.75f, -0.25f, 0.25f, 0.75f});
+  CHECK(note.empty());
+  CHECK(decode(tokens, {7}, 1, 1, note) == std::vector<float>{0.75f});  // the last id has the bin before it
+  CHECK(note.empty());
+  CHECK(decode(tokens, {15, 0}, 1, 2, note) == std::vector<float>{-0.75f, 0.75f});
+  CHECK(contains(note, "id 0 is none of the 5 actions"));
+  CHECK(contains(refusal(tokens.decode(Ids{11}, 1, 2), Code::bad_action), "found 1"));
+  keys.set("action_tokens.first_id", std::int64_t{3});
+  CHECK(contains(refusal(ActionTokens::read(keys), Code::bad_bundle), "action_tokens.n_bin"));
 }
