@@ -36,6 +36,10 @@ std::string ByteFallbackBpe::mark_blanks(std::string_view text) {
   return marked;
 }
 
+std::string ByteFallbackBpe::mark_blanks_and_first(std::string_view text) {
+  return text.empty() ? std::string() : mark_blanks(" ") + mark_blanks(text);
+}
+
 void ByteFallbackBpe::encode(std::string_view piece, std::vector<std::int32_t>& ids) const {
   std::vector<std::int32_t> symbols;
   symbols.reserve(piece.size());

@@ -25,6 +25,8 @@ class ByteFallbackBpe {
 
   /// `text` with every space written as U+2581.
   static std::string mark_blanks(std::string_view text);
+  /// The same with a U+2581 in front, unless there is no text.
+  static std::string mark_blanks_and_first(std::string_view text);
 
   /// Appends the ids of valid UTF-8 with marked spaces. The whole piece is one word.
   void encode(std::string_view piece, std::vector<std::int32_t>& ids) const;

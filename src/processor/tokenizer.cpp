@@ -66,8 +66,10 @@ Status read_normalization(const Keys& keys, Kind kind, AddedTokens::Normalize& n
   if (!keys.has(kKey) && kind != Kind::wordpiece) return {};
   VLA_TRY(const std::string form, keys.string(kKey));
   if (kind == Kind::byte_level && form == "nfc") return normalize = nfc, Status();
+  if (kind == Kind::byte_fallback && form == "blank_first")
+    return normalize = ByteFallbackBpe::mark_blanks_and_first, Status();
   if (kind == Kind::wordpiece && form == "bert_uncased") return normalize = WordPiece::normalize, Status();
-  constexpr const char* kExpected[] = {"nfc, or no such key", "no such key beside byte_fallback_bpe", "bert_uncased"};
+  constexpr const char* kExpected[] = {"nfc, or no such key", "blank_first, or no such key", "bert_uncased"};
   return Error{Code::bad_bundle, kKey, kExpected[static_cast<int>(kind)], form};
 }
 

@@ -24,6 +24,16 @@ def test_vocabulary_merges_and_prefix_are_those_of_the_file(converter):
     assert "tokenizer.pre" not in keys and "tokenizer.ignore_merges" not in keys
 
 
+def test_a_blank_in_front_of_every_text_is_told(converter):
+    tiny = TinyPi()
+    tiny.tokenizer["normalizer"] = {
+        "type": "Sequence",
+        "normalizers": [{"type": "Prepend", "prepend": BLANK}, {"type": "Replace", "pattern": {"String": " "}, "content": BLANK}],
+    }
+    assert keys_of(converter, tiny)["tokenizer.normalization"] == "blank_first"
+    assert "tokenizer.normalization" not in keys_of(converter, TinyPi())
+
+
 def test_a_token_beyond_the_embedding_is_kept_without_a_row(converter):
     added = {token["content"]: token["id"] for token in json.loads(keys_of(converter, TinyPi())["tokenizer.added"])}
     assert added["<image>"] == -1 and added["<bos>"] == 2
@@ -76,8 +86,8 @@ REFUSED = {
     "model.dropout: expected None, found 0.5": model(dropout=0.5),
     "model.vocab: expected all 256 byte symbols, found 1 missing, the first is '<0x41>'": remove("<0x41>"),
     "found 1 missing, the first is '<0xC3>'": remove("<0xC3>"),
-    "normalizer: expected blanks replaced by U+2581 and nothing else, found null": spec(normalizer=None),
-    "normalizer: expected blanks replaced by U+2581 and nothing else, found {": spec(
+    "normalizer: expected blanks replaced by U+2581, and at most one in front of them before, found null": spec(normalizer=None),
+    "normalizer: expected blanks replaced by U+2581, and at most one in front of them before, found {": spec(
         normalizer={"type": "Sequence", "normalizers": [{"type": "Prepend", "prepend": BLANK}]}
     ),
     "pre_tokenizer: expected none, or Split at blanks": spec(pre_tokenizer=SPLIT),

@@ -102,6 +102,18 @@ TEST_CASE("empty text has no tokens but those that stand in front of every text"
   CHECK(load("gemma").prefix() == std::vector<std::int32_t>{2});
 }
 
+TEST_CASE("a blank stands in front of every text between added tokens where the keys say so") {
+  Keys keys = tokenizer_keys("gemma");
+  keys.set("tokenizer.normalization", std::string("blank_first"));
+  const Tokenizer tokenizer = make(keys), plain = load("gemma");
+  const std::pair<const char*, const char*> cases[] = {{"", ""},
+                                                       {"pick", " pick"},
+                                                       {" pick", "  pick"},
+                                                       {"pick<bos>up ", " pick<bos> up "},
+                                                       {"<bos><bos> a", "<bos><bos>  a"}};
+  for (const auto& [text, spelt] : cases) CHECK(encode(tokenizer, text) == encode(plain, spelt));
+}
+
 TEST_CASE("text with a token that the embedding has no row for is refused") {
   Keys keys = tokenizer_keys("gemma");
   Json added = Json::parse(*keys.string("tokenizer.added"));
@@ -235,7 +247,7 @@ TEST_CASE("pre-tokenizer steps that the runtime does not know are refused") {
   }
 }
 
-TEST_CASE("another normalization, or one beside byte fallback, is refused") {
+TEST_CASE("another normalization is refused") {
   Keys keys = tokenizer_keys("qwen");
   keys.set("tokenizer.normalization", std::string("nfkc"));
   CHECK(contains(refused_keys(keys), "tokenizer.normalization: expected nfc, or no such key, found nfkc"));

@@ -33,7 +33,8 @@ def tokenizer_of(keys):
         tokenizer.normalizer = normalizers.BertNormalizer(lowercase=True)
         tokenizer.pre_tokenizer = pre_tokenizers.BertPreTokenizer()
     elif keys["tokenizer.kind"] == "byte_fallback_bpe":
-        tokenizer.normalizer = normalizers.Replace(" ", "\u2581")
+        first = [normalizers.Prepend("\u2581")] if normalization == "blank_first" else []
+        tokenizer.normalizer = normalizers.Sequence([*first, normalizers.Replace(" ", "\u2581")])
     else:
         tokenizer.pre_tokenizer = pre_tokenizers.Sequence([_pre(step) for step in json.loads(keys["tokenizer.pre"])])
         if normalization == "nfc":

@@ -111,7 +111,8 @@ def _with_class(folder: str, config: dict) -> dict:
     stated = read_json(path) if os.path.isfile(path) else {}
     own = CLASSES.get(str(stated.get("model_type")))
     named = config.get("tokenizer_class") or (None if own else stated.get("tokenizer_class"))
-    if own is None or config.get("auto_map") is not None:
+    auto_map = config.get("auto_map")
+    if own is None or (auto_map.get("AutoTokenizer") if isinstance(auto_map, dict) else auto_map) is not None:
         return dict(config, tokenizer_class=named)
     same = named is None or str(named).replace("Fast", "") == own
     return dict(config, tokenizer_class=own if same else GENERIC[0])

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""BPE with byte fallback: what Gemma and PaliGemma publish.
+"""BPE with byte fallback: what Gemma, PaliGemma and Llama 2 publish.
 
-Text is normalized by one rule, blanks to U+2581, and is not split at all: the pre-tokenizer of the published file splits at blanks,
-of which none are left. transformers' GemmaTokenizer builds the same around vocabulary and merges.
+Text is normalized by one rule, blanks to U+2581, and is not split at all: the pre-tokenizer of Gemma's file splits at blanks,
+of which none are left. transformers' GemmaTokenizer builds the same around vocabulary and merges. Llama 2's file puts a U+2581 in front
+of every text between added tokens, too.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ MODEL = {
 }
 BLANK = {"String": " "}
 NORMALIZER = [{"type": "Replace", "pattern": BLANK, "content": "\u2581"}]
+BLANK_FIRST = [{"type": "Prepend", "prepend": "\u2581"}, *NORMALIZER]
 
 
 def with_defaults(config: dict) -> dict:
@@ -40,10 +42,11 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     check_symbols(tokenizer.model, _needed_bytes(member(tokenizer.model, "vocab", dict, JSON_FILE)), problems)
     check_class(tokenizer.config, GENERIC + GEMMA, problems)
     spec = tokenizer.spec
-    if one_or_sequence(spec.get("normalizer"), "normalizers") != NORMALIZER:
+    steps = one_or_sequence(spec.get("normalizer"), "normalizers")
+    if steps not in (NORMALIZER, BLANK_FIRST):
         problems.unsupported(
             JSON_FILE + ": normalizer",
-            "blanks replaced by U+2581 and nothing else",
+            "blanks replaced by U+2581, and at most one in front of them before",
             to_json(spec.get("normalizer"))[:120],
             "the runtime does not normalize text otherwise",
         )
@@ -51,7 +54,8 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
         if not isinstance(step, dict) or step.get("type") != "Split" or step.get("pattern") != BLANK:
             problems.unsupported(JSON_FILE + ": pre_tokenizer", "none, or Split at blanks, which are gone by then", to_json(step)[:120])
     _check_characters(tokenizer, problems)
-    return [Key("tokenizer.prefix_ids", "u32[]", prefix_ids(tokenizer, problems))]
+    blank_first = [Key("tokenizer.normalization", "string", "blank_first")] if steps == BLANK_FIRST else []
+    return [*blank_first, Key("tokenizer.prefix_ids", "u32[]", prefix_ids(tokenizer, problems))]
 
 
 def _needed_bytes(vocab: dict) -> List[str]:
