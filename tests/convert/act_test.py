@@ -59,7 +59,7 @@ def test_a_convolution_with_its_batch_norm_is_one_convolution(folder):
     tensors = open_checkpoint(str(folder), {}).tensors
     name, norm = "model.backbone.layer2.0.conv1.weight", "model.backbone.layer2.0.bn1"
     weight, scale, bias, mean, variance = (
-        batch_norm._whole(tensors[key]) for key in (name, *(f"{norm}.{part}" for part in batch_norm.PARTS))
+        batch_norm.whole(tensors[key]) for key in (name, *(f"{norm}.{part}" for part in batch_norm.PARTS))
     )
     x = np.random.default_rng(0).normal(size=(64, 3, 3))  # under the window: features, rows, columns
     y = (np.einsum("oirc,irc->o", weight, x) - mean) / np.sqrt(variance + 1e-5) * scale + bias

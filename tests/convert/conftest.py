@@ -11,7 +11,7 @@ sys.path.insert(0, os.path.dirname(__file__))
 pytest.register_assert_rewrite("manifests")
 # The package under test is the one beside these tests, installed or not.
 ROOT = os.path.join(os.path.dirname(__file__), "..", "..")
-sys.path[:0] = [os.path.join(ROOT, "python"), os.path.join(ROOT, "tools")]
+sys.path[:0] = [os.path.join(ROOT, name) for name in ("python", "tools", "tests/support")]
 
 from goldens.files import write_json  # noqa: E402
 from tiny import Tiny  # noqa: E402

@@ -91,11 +91,12 @@ def versions() -> str:
 def config_type(checkpoint) -> str:
     """The architecture: LeRobot's config.json names it as its type, authors' files state a model_type; Evo-1's nothing, TurboVLA's have none."""
     from vla_cpp.convert.archs import authors
+    from vla_cpp.convert.checkpoint import of_model_type
 
     if not (Path(checkpoint) / "config.json").is_file():
         return next(arch for arch, layout in authors().items() if not layout.has_config and layout.tells(str(checkpoint)))
     config = json.loads((Path(checkpoint) / "config.json").read_text())
-    return config.get("type") or next((arch for arch, layout in authors().items() if config.get("model_type") in layout.model_types), "evo1")
+    return config.get("type") or of_model_type(config, authors()) or "evo1"
 
 
 def described(checkpoint) -> str:
@@ -244,8 +245,8 @@ class ChunkRecorder(Taps):
 
 def network_order(name):
     """Sort key: inputs, vision, prefix, language layers with keys and values before their output, steps, result."""
-    stages = ("pixels", "tokens", "state", "position_ids", "vision", "deepstack", "connector", "connector_down", "projector", "prefix", "encoder", "lm",
-              "vl", "vlm_in", "aux_in", "state_in", "state_out", "expert", "head", "dit", "step", "chunk")
+    stages = ("pixels", "tokens", "state", "position_ids", "vision", "dino", "siglip", "deepstack", "connector", "connector_down", "projector", "prefix", "encoder", "lm",
+              "vl", "vlm_in", "aux_in", "state_in", "state_out", "expert", "head", "dit", "logits", "step", "tokens_out", "chunk")
     parts = name.split(".")
     stage = stages.index(parts[0]) if parts[0] in stages else len(stages)
     i = next((int(p) for p in parts if p.isdigit()), 1000 if name in ("vision.post_norm", "lm.norm") else -1)
@@ -290,7 +291,7 @@ def read_taps(file):
 
 # Cases of which every tap is kept: one of each family, and all of BitVLA, whose parts are compared on the reference's own inputs.
 EVERY_TAP = {"act/pre_norm", "bitvla/micro", "bitvla/one_view", "bitvla/two_layers", "diffusion/ddim", "evo1/two_views", "gr00t_n1_5/percentiles",
-             "gr00t_n1_6/aspect", "gr00t_n1_7/percentiles", "pi0/absent_view", "pi05/long_text", "pi0_fast/stops", "smolvla/long_text",
+             "gr00t_n1_6/aspect", "gr00t_n1_7/percentiles", "openvla/bridge", "pi0/absent_view", "pi05/long_text", "pi0_fast/stops", "smolvla/long_text",
              "turbovla/long_text", "turbovla_authors/two_views", "vla_jepa/three_views", "xvla/two_arms"}
 
 

@@ -17,6 +17,7 @@ TASKS = [
 ]
 SMOLLM_SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>"]
 GEMMA_SPECIAL = ["<pad>", "<eos>", "<bos>", "<unk>"]
+LLAMA2 = ["<unk>", "<s>", "</s>"]
 INTERNVL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<img>", "</img>", "<IMG_CONTEXT>", "<quad>", "</quad>"]
 QWEN_VL = [f"<|{name}|>" for name in (
     "endoftext", "im_start", "im_end", "object_ref_start", "object_ref_end", "box_start", "box_end", "quad_start", "quad_end",
@@ -180,5 +181,39 @@ def bitvla(folder, n_merge=120):
         "tokenizer_class": "PreTrainedTokenizerFast"}, indent=1) + "\n")
 
 
+def openvla(folder, n_piece=150):
+    """Llama 2's form with other merges: byte fallback, a blank in front of every text, single characters behind all other pieces, of which
+    U+2581 is the first, and no line feed.  OpenVLA adds <PAD>."""
+    from tokenizers import Regex, Tokenizer, models, normalizers, pre_tokenizers, trainers
+
+    fast = Tokenizer(models.BPE(unk_token="<unk>"))
+    fast.normalizer = normalizers.Sequence([normalizers.Prepend("▁"), normalizers.Replace(" ", "▁")])
+    fast.pre_tokenizer = pre_tokenizers.Split(Regex(r"\d|\n|▁?[^▁\d\n]+|▁"), "isolated")
+    corpus = [f"In: What action should the robot take to {task}?\nOut: 0 1 2 3 4 5 6 7 8 9" for task in TASKS]
+    fast.train_from_iterator(corpus, trainers.BpeTrainer(vocab_size=len(LLAMA2) + n_piece, special_tokens=LLAMA2, show_progress=False))
+    spec = json.loads(fast.to_str())
+    pieces = sorted(set(spec["model"]["vocab"]) - {*LLAMA2, "\n"}, key=lambda piece: (len(piece) == 1, piece != "▁", spec["model"]["vocab"][piece]))
+    order = LLAMA2 + [f"<0x{b:02X}>" for b in range(256)] + pieces
+    flags = {"single_word": False, "lstrip": False, "rstrip": False, "normalized": False, "special": True}
+    spec["added_tokens"] = [{"id": i, "content": token, **flags} for i, token in [*enumerate(LLAMA2), (len(order), "<PAD>")]]
+    spec["model"] |= {"vocab": {t: i for i, t in enumerate(order)}, "byte_fallback": True, "fuse_unk": True,
+                      "merges": [merge if isinstance(merge, str) else " ".join(merge) for merge in spec["model"]["merges"]]}
+    start, text = {"SpecialToken": {"id": "<s>", "type_id": 0}}, {"Sequence": {"id": "A", "type_id": 0}}
+    other = [{"SpecialToken": {"id": "<s>", "type_id": 1}}, {"Sequence": {"id": "B", "type_id": 1}}]
+    spec |= {"pre_tokenizer": None, "post_processor": {
+        "type": "TemplateProcessing", "single": [start, text], "pair": [start, text, *other],
+        "special_tokens": {"<s>": {"id": "<s>", "ids": [1], "tokens": ["<s>"]}}}}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "tokenizer.json").write_text(json.dumps(spec, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / "tokenizer_config.json").write_text(json.dumps({
+        "add_bos_token": True, "add_eos_token": False,
+        "added_tokens_decoder": {str(t["id"]): {k: v for k, v in t.items() if k != "id"} for t in spec["added_tokens"]},
+        "auto_map": {"AutoProcessor": "processing_prismatic.PrismaticProcessor"}, "bos_token": "<s>", "clean_up_tokenization_spaces": False,
+        "eos_token": "</s>", "legacy": False, "model_max_length": 2048, "pad_token": "<PAD>", "padding_side": "right",
+        "processor_class": "PrismaticProcessor", "sp_model_kwargs": {}, "tokenizer_class": "LlamaTokenizer", "unk_token": "<unk>",
+        "use_default_system_prompt": False}, indent=1) + "\n")
+
+
 if __name__ == "__main__":
-    {"bart": bart, "bert": bert, "bitvla": bitvla, "eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))
+    {"bart": bart, "bert": bert, "bitvla": bitvla, "eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t,
+     "openvla": openvla}[sys.argv[1]](Path(sys.argv[2]))

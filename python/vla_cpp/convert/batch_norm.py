@@ -28,14 +28,14 @@ def shapes(name: str, d: int) -> Dict[str, Tuple[int, ...]]:
 
 def folded(entry: Entry, name: str, tensors: Mapping[str, Entry]) -> np.ndarray:
     """Of the convolution's weight (out, in, row, column) the matrix in float32, columns row, column, in; of the norm's bias the bias."""
-    weight, bias, mean, variance = (_whole(tensors["{}.{}".format(name, part)]) for part in PARTS)
+    weight, bias, mean, variance = (whole(tensors["{}.{}".format(name, part)]) for part in PARTS)
     with np.errstate(all="ignore"):  # what is not finite is reported with the tensor
         scale = weight / np.sqrt(variance + EPS)
         if len(entry.shape) == 1:
             return (bias - mean * scale).astype(np.float32)
-        product = _whole(entry) * scale[:, None, None, None]
+        product = whole(entry) * scale[:, None, None, None]
         return product.transpose(0, 2, 3, 1).astype(np.float32).ravel()
 
 
-def _whole(entry: Entry) -> np.ndarray:
+def whole(entry: Entry) -> np.ndarray:
     return np.concatenate([to_f32(part, entry.dtype) for part in entry.chunks()]).reshape(entry.shape).astype(np.float64)

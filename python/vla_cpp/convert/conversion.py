@@ -14,10 +14,9 @@ import numpy as np
 
 from .. import __version__
 from ..output import is_file, is_special
-from . import archs
+from . import archs, batch_norm, standardized
 from .adapters import merge, stored_dtype
 from .archs import MATRIX, SCALE, TABLE, TERNARY, Options, Plan, Weight
-from .batch_norm import folded, shapes
 from .bundle import BUNDLE_VERSION, BundleWriter, Key, TensorInfo
 from .checkpoint import GROOT, LEROBOT, Checkpoint, given_backbone, open_checkpoint
 from .dtypes import BUNDLE_NAME, WEIGHTS, convert, from_f32, to_f32
@@ -113,7 +112,7 @@ def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, 
     expected = {weight.source: weight.stored for weight in plan.weights}
     for weight in plan.weights:
         if weight.batch_norm:
-            expected.update(shapes(weight.batch_norm, weight.stored[0]))
+            expected.update(batch_norm.shapes(weight.batch_norm, weight.stored[0]))
     optional = {row.source: row for row in plan.dropped}
     for source in expected:
         shared = checkpoint.aliases.get(source)
@@ -180,7 +179,7 @@ def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
 def _tensor_dtype(weight: Weight, stored: str, dtype: str) -> str:
     if weight.kind == TERNARY:
         return "i8"
-    exact = weight.kind not in (MATRIX, TABLE) or (weight.keep_f32 and stored == "F32")
+    exact = weight.kind not in (MATRIX, TABLE) or (weight.keep_f32 and (stored == "F32" or weight.pixels is not None))
     return "f32" if exact else dtype
 
 
@@ -248,7 +247,9 @@ def _stream(checkpoint: Checkpoint, weight: Weight, tensor: TensorInfo, out: Bun
     finite, overflow = True, False
     pieces, stored = _pieces(entry, weight), entry.dtype
     if weight.batch_norm:
-        pieces, stored = iter([folded(entry, weight.batch_norm, checkpoint.tensors)]), "F32"
+        pieces, stored = iter([batch_norm.folded(entry, weight.batch_norm, checkpoint.tensors)]), "F32"
+    if weight.pixels:
+        pieces, stored = iter([standardized.folded(entry, weight.pixels, checkpoint.tensors)]), "F32"
     for raw in pieces:
         part = convert(raw, stored, tensor.dtype)
         if weight.in_bf16:

@@ -18,6 +18,7 @@ from ..bundle import Key
 from ..checkpoint import LEROBOT, OPENPI, Checkpoint, Layout, Tensors, read_stored
 from ..errors import Code, Problems, refuse
 from ..options import ACTION_TOKENIZER, COMMON, DOMAIN, IDENTITY_STATS, POSITION_PRECISION, WIDTHS, Option, stats, variant
+from ..standardized import Standardized
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
 TERNARY, SCALE = "ternary", "scale"  # of a matrix of -1, 0 and 1 and one factor: its codes, and the factor
@@ -38,6 +39,7 @@ class Weight(NamedTuple):
     transpose: bool = False  # what is left after `pick`, stored as (in, out)
     in_bf16: bool = False  # the reference rounds it to bfloat16 when it loads it, whatever it is stored as
     batch_norm: str = ""  # a convolution's matrix, or the bias that it gets, with the frozen batch norm of this name behind it
+    pixels: Optional[Standardized] = None  # of a patch embedding and its bias: it reads standardized pixels, the bundle's those from 0 to 1
     axes: Tuple[int, ...] = ()  # the source's axes in the order in which the bundle has them
     regroup: int = 0  # the last axis is stored as groups of this many numbers: the bundle has all first ones, all second ones, ...
 
