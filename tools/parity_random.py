@@ -34,7 +34,7 @@ from pathlib import Path
 
 import numpy as np
 from goldens import (
-    act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla, turbovla_authors, vla_jepa, xvla)
+    act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, openvla, pi, recorder, rtc, smolvla, turbovla, turbovla_authors, vla_jepa, xvla)
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -257,6 +257,23 @@ def draw_turbovla_authors(seed):
     checkpoint = turbovla_authors.Checkpoint(vision, text, parts, tuple(views))
     options = {"vision_tokens": turbovla_authors.tokens_read(), "views": views}
     return cases.Case(seed, {view: (side, side, "png") for view in views}, words, checkpoint, options=options)
+
+
+def draw_openvla(seed):
+    """The same for OpenVLA: widths of both towers, sides, heads that share keys, bins, numbers of an action, statistics, shards."""
+    r = random.Random(f"openvla {seed}")
+    kv, d_head = r.choice((1, 2, 3)), r.choice((4, 6, 8, 16))
+    heads = kv * r.choice((1, 2, 3))
+    towers = [openvla.Tower(16 * r.choice((1, 2, 3, 4)), r.randint(2, 5), r.randint(10, 70)) for _ in range(2)]
+    text = openvla.decoder(heads * d_head, r.randint(1, 4), heads, kv, r.choice((20, 36, 50)), rms_norm_eps=r.choice((1e-6, 1e-5)),
+                           rope_theta=r.choice((10000.0, 500.0)))
+    d_action = r.randint(1, 9)
+    unmasked = r.choice((None, (), (d_action - 1,), tuple(i for i in range(d_action) if r.random() < 0.4)))
+    others = r.choice(((), ("fractal20220817_data", "taco_play")))
+    checkpoint = openvla.Checkpoint(*towers, text, 14 * r.choice((1, 2, 2, 3)), d_action, r.choice((256, 256, 2, 17, 100)), r.choice((1, 1, 3)),
+                                    r.random() < 0.3, others, unmasked)
+    frame = r.randint(10, 90), r.randint(10, 90), r.choice(("png", "png", "jpg"))
+    return openvla.case(seed, frame, r.choice((*TEXTS, "", "Pick UP the <s> cube</s> \u2581", "<PAD>")), checkpoint, **({"stats": "bridge_orig"} if others else {}))
 
 
 def draw_vla_jepa(seed):
@@ -482,7 +499,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "openvla": draw_openvla, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
 
