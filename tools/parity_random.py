@@ -34,7 +34,7 @@ from pathlib import Path
 
 import numpy as np
 from goldens import (
-    act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, openvla, pi, recorder, rtc, smolvla, turbovla, turbovla_authors, vla_jepa, xvla)
+    act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, openvla, pi, pi0_fast, recorder, rtc, smolvla, turbovla, turbovla_authors, vla_jepa, xvla)
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -99,6 +99,23 @@ def draw_pi(arch, seed):
     vision = pi.tower(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)))
     checkpoint = pi.Checkpoint(arch, policy, vision, lm, expert, views, d_state, d_action)
     return cases.Case(seed, frames, r.choice(TEXTS), checkpoint)
+
+
+def draw_pi0_fast(seed):
+    """The same for π0-FAST, whose random answers begin with no prefix: where one is required both refuse."""
+    r = random.Random(f"pi0_fast {seed}")
+    kv, vision_heads, d_head = r.choice((1, 1, 2, 3)), r.choice((1, 2, 3, 5)), r.choice((4, 8, 12, 16, 32))
+    n_empty, d_state, d_action, n_row = r.choice((0, 0, 1)), r.randint(1, 14), r.randint(1, 14), r.randint(1, 12)
+    views, frames = draw_views(r, n_empty)
+    policy = pi0_fast.policy(
+        (n_row + r.choice((0, 0, 3)), n_row), r.choice((1, 2, 5, 20, 40)), 14 * r.choice((1, 2, 2, 3, 4)), r.choice((8, 24, 48, 200)), empty_cameras=n_empty,
+        normalization_mapping={"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)}, fast_skip_tokens=r.choice((0, 1, 9)),
+        validate_action_token_prefix=r.random() < 0.1, use_kv_cache=r.random() < 0.7, use_relative_actions=d_state >= d_action and r.random() < 0.3)
+    lm = pi.gemma(r.choice((16, 24, 36, 40)), r.randint(1, 4), kv * r.choice((1, 2, 4, 8)), kv, d_head, r.choice((32, 50)))
+    vision = pi.tower(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)))
+    low = r.choice((-80, -40, -150))
+    fast = pi0_fast.Fast(-2 * low, low, r.choice((10, 5, 12.5)))
+    return cases.Case(seed, frames, r.choice(TEXTS), pi0_fast.Checkpoint(policy, vision, lm, views, d_state, d_action, fast))
 
 
 def draw_evo1(seed):
@@ -499,7 +516,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "openvla": draw_openvla, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "openvla": draw_openvla, "pi0_fast": draw_pi0_fast, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
 

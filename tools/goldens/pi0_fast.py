@@ -247,7 +247,7 @@ class Recorder(ChunkRecorder):
 
     def tap(self, name, x):
         if self.step >= 0:
-            self.put(f"step.{self.step}.{name}", x[0])
+            self.put(f"step.{self.step}.{name}", x[0, -1:])  # without its cache the reference computes all of them again
         elif name == "lm.norm":
             self.put(name, x[0, -1:])
         else:
@@ -265,7 +265,10 @@ class Recorder(ChunkRecorder):
         return out
 
     def on_tokens(self, tokens, **kwargs):
-        self.put("tokens_out", tokens[0, : self.step + 1])
+        ids = tokens[0, : self.step + 1].tolist()
+        stop = self.policy._paligemma_tokenizer.convert_tokens_to_ids(STOP)
+        self.n_emitted = ids.index(stop) + 1 if stop in ids else len(ids)
+        self.put("tokens_out", tokens[0, : self.n_emitted])
         return self.detokenize(tokens, **kwargs)
 
     def run(self, batch, noise):
@@ -276,5 +279,5 @@ class Recorder(ChunkRecorder):
             self.put("chunk", self.policy.predict_action_chunk(dict(batch))[0])
         for name, seen in self.views.items():
             self.put(name, torch.cat([x for x, here in zip(seen, self.present, strict=True) if here]))
-        kept = {"0", str(self.step - 1)}
+        kept = {"0", str(self.n_emitted - 2)}
         return {name: values for name, values in self.taps.items() if not name.startswith("step.") or name.split(".")[1] in kept}
