@@ -84,6 +84,8 @@ def added_tokens(spec: dict, model: dict, config: dict, problems: Problems, note
         if not isinstance(content, str) or not content or type(number) is not int or number < 0:
             problems.add(JSON_FILE + ": added_tokens", "tokens with id and content", to_json(token)[:80])
             continue
+        if any(not isinstance(token.get(flag), bool) for flag in FLAGS):
+            problems.add(JSON_FILE + ": added_tokens", "tokens with true or false for " + ", ".join(FLAGS), to_json(token)[:120])
         there = next((other for other in added if other["content"] == content), None)
         own = there["id"] if there else vocab.get(content, next_id(added, vocab))
         if own != number:
