@@ -57,7 +57,9 @@ def test_the_keys_of_a_bundle(planned):
     assert keys["action_tokens.required_ids"] == keys["action_tokens.prefix_ids"][:2]
     assert keys["action_tokens.first_id"] == SMALL.n_vocab - 1 - 5
     assert (keys["action_tokens.kind"], keys["action_tokens.scale"], keys["action_tokens.min_token"]) == ("fast", 10.0, -80.0)
-    assert {token: i for i, token in enumerate(keys["action_tokens.vocab"])} == SMALL.fast.vocabulary()[0]
+    vocab, own = keys["action_tokens.vocab"], SMALL.fast.vocabulary()[0]
+    assert len(vocab) == len(own) and vocab[ord("P")] == "P" and all(vocab[i] == token for token, i in own.items() if i >= SMALL.fast.n_character)
+    assert vocab[:2] == ["\u0100", "\u0101"] and vocab[130] == "\u00c2\u0124"  # bytes of U+0000, U+0001 and U+0082
 
 
 def test_the_prompt_stands_between_two_beginnings_and_its_limit_does_not_count_the_second_one(planned):

@@ -17,6 +17,7 @@ from .errors import Code, Problems, refuse
 from .files import member, read_json
 from .section import Section
 from .tokenizer import TokenizerPlan
+from .tokenizer_byte_level import byte_symbols
 from .tokenizer_parts import CONFIG_FILE, GENERIC, JSON_FILE, NAMED, check_class, to_json
 
 PROCESSOR_FILE, TOKENIZER_FOLDER = "processor_config.json", "bpe_tokenizer"
@@ -108,8 +109,13 @@ def _vocabulary(folder: str, problems: Problems) -> List[str]:
     if not vocab or not sound:
         problems.add(where + ": model.vocab", "tokens with ids of their own", "{} tokens".format(len(vocab)))
         return [""]
-    by_id = {i: token for token, i in vocab.items()}
+    by_id, symbols = {i: token for token, i in vocab.items()}, byte_symbols()
     for token in vocab:
         if token != token.encode("utf-8", "replace").decode():
             problems.add(where + ": model.vocab", "UTF-8 text", ascii(token)[:80])
-    return [by_id.get(i, "") for i in range(max(by_id) + 1)]
+    return [_spelt(by_id.get(i, ""), symbols) for i in range(max(by_id) + 1)]
+
+
+def _spelt(token: str, symbols: List[str]) -> str:
+    """The decoder takes a token with a character that is no symbol of a byte as it is. Training puts such ones into the vocabulary."""
+    return token if set(token) <= set(symbols) else "".join(symbols[byte] for byte in token.encode("utf-8", "replace"))
