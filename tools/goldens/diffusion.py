@@ -335,10 +335,10 @@ class Recorder(Taps):
             self.put(f"step.{self.step - 1}.x", args[0][0])
 
     def is_told(self, step):
-        """Whether the rounding of the network's output is not multiplied by more than 100 in x: a predicted sample is divided by the root of a
-        product of alphas, which the first steps of a schedule have near 0."""
+        """Whether x may be judged: a predicted sample is divided by the root of a product of alphas, which the first steps of a schedule have
+        near 0, so that the rounding of the network's output stays in x until a tenth of it is the sample's."""
         scheduler = self.policy.diffusion.noise_scheduler
-        return scheduler.config.prediction_type == "sample" or scheduler.alphas_cumprod[scheduler.timesteps[step]] > 1e-4
+        return scheduler.config.prediction_type == "sample" or scheduler.alphas_cumprod[scheduler.timesteps[step]] > 0.1
 
     def run(self, batch, noise):
         """Every tap of one inference."""
