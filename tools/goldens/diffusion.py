@@ -216,7 +216,7 @@ def sizes(horizon, n_action, widths, d_time, groups, keypoints, **more):
 
 CASES = {
     # As published: groups, a crop, one camera at two moments, all steps of DDPM.
-    "diffusion/ddpm": case(61, ("png",), Checkpoint(
+    "diffusion/ddpm": case(75, ("png",), Checkpoint(
         sizes(16, 8, (24, 32, 48), 12, 8, 5, use_group_norm=True, crop_shape=[41, 68], use_separate_rgb_encoder_per_camera=False,
               num_train_timesteps=12), {"image": (48, 75)}, d_state=2, d_action=2)),
     # DDIM in fewer steps than were trained; two cameras with an encoder each, batch norms, a resize; shifts alone; three moments.
