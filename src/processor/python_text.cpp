@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "processor/python_text.h"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <iterator>
 
@@ -13,7 +15,7 @@ namespace {
 
 /// Flags of a run of code points. A cased character is part of a word of letters; an ignorable one, such as an
 /// apostrophe, does not end the word.
-enum Class : std::uint8_t { kAlnum = 1, kCased = 2, kIgnorable = 4 };
+enum Class : std::uint8_t { kAlnum = 1, kCased = 2, kIgnorable = 4, kPrintable = 8 };
 
 struct Run {
   std::uint32_t start;
@@ -45,6 +47,14 @@ bool meets_cased(std::string_view text, bool before) {
     before ? text.remove_suffix(c.size) : text.remove_prefix(c.size);
   }
   return false;
+}
+
+std::string escaped(std::uint32_t c) {
+  if (c == '\t') return "\\t";
+  if (c == '\n') return "\\n";
+  if (c == '\r') return "\\r";
+  if (c <= 0xFF) return fmt::format("\\x{:02x}", c);
+  return c <= 0xFFFF ? fmt::format("\\u{:04x}", c) : fmt::format("\\U{:08x}", c);
 }
 
 }  // namespace
@@ -84,6 +94,19 @@ std::string drop_punctuation(std::string_view text) {
     text.remove_prefix(c.size);
   }
   return out;
+}
+
+std::string list_of(std::string_view text) {
+  const bool has_apostrophe = text.find('\'') != std::string_view::npos;
+  const char quote = has_apostrophe && text.find('"') == std::string_view::npos ? '"' : '\'';
+  std::string out = {'[', quote};
+  while (!text.empty()) {
+    const unicode::Char c = unicode::first(text);
+    if (c.code_point == '\\' || c.code_point == static_cast<unsigned char>(quote)) out.push_back('\\');
+    out += (classes(c.code_point) & kPrintable) != 0 ? std::string(text.substr(0, c.size)) : escaped(c.code_point);
+    text.remove_prefix(c.size);
+  }
+  return out.append({quote, ']'});
 }
 
 }  // namespace vla::python

@@ -24,4 +24,7 @@ std::string lower(std::string_view text);
 /// re.sub(r"[^\w\s]", "", text).
 std::string drop_punctuation(std::string_view text);
 
+/// str([text]) of valid UTF-8: the text between brackets and quotes, with escapes for what is not printable.
+std::string list_of(std::string_view text);
+
 }  // namespace vla::python

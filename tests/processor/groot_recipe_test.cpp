@@ -75,6 +75,30 @@ TEST_CASE("text is lower-cased and cleaned as Python does it") {
   CHECK(python::drop_punctuation("don't_stop -- n\u00b0 3\u00bd\u3002\u5f00\n") == "dont_stop  n 3\u00bd\u5f00\n");
 }
 
+TEST_CASE("a text is printed as a list of Python prints it") {
+  CHECK(python::list_of("pick up the cup") == "['pick up the cup']");
+  CHECK(python::list_of("") == "['']");
+  CHECK(python::list_of("the robot's cup") == "[\"the robot's cup\"]");
+  CHECK(python::list_of("the robot's \"cup\"") == "['the robot\\'s \"cup\"']");
+  CHECK(python::list_of("a \"cup\"\\ {x}") == "['a \"cup\"\\\\ {x}']");
+  CHECK(python::list_of("\t\n\r\v\x7f\u00a0\u00ad") == R"(['\t\n\r\x0b\x7f\xa0\xad'])");
+  CHECK(python::list_of("n\u00b0 \u5f00 \U0001f642\u200b\u2028\U000e0001") ==
+        "['n\u00b0 \u5f00 \U0001f642\\u200b\\u2028\\U000e0001']");
+}
+
+TEST_CASE("texts that a recipe quotes again and again are refused before they are large") {
+  Json recipe = Json::parse(kRecipe);
+  for (int i = 0; i < 10; ++i) recipe["text"].insert(recipe["text"].begin(), Json{{"op", "python_list"}});
+  EditableBundle bundle = groot();
+  bundle.set("processor.recipe", recipe.dump());
+  Observation words = observation();
+  words.states["state"] = {0.0f, 5.0f};
+  for (const char* view : {"top", "wrist", "side"}) words.views[view] = Frame{4, 4, std::vector<std::uint8_t>(48, 255)};
+  words.text = std::string(2000, '\\');
+  CHECK(refusal(make(bundle).encode(words), Code::bad_observation).find("makes a prompt of at most") !=
+        std::string::npos);
+}
+
 TEST_CASE("the kinds of GR00T have no epsilon and leave what has no spread") {
   using Direction = Normalizer::Direction;
   const auto map = [](const char* kind, Direction direction, double low, double high, float x) {

@@ -28,7 +28,7 @@ constexpr const char* kLists[][2] = {
                   {"op": "resize_floats", "width": 6, "height": 4, "filter": "bicubic"}])"},
     {"text",
      R"([{"op": "refuse", "text": "<|"}, {"op": "strip"}, {"op": "lower"}, {"op": "replace", "from": "p", "to": "q r"}, {"op": "drop_punctuation"},
-                 {"op": "template", "text": "Do: {instruction}!"}, {"op": "tokenize", "max_tokens": 8, "truncate": "left"}])"},
+                 {"op": "python_list"}, {"op": "template", "text": "Do: {instruction}!"}, {"op": "tokenize", "max_tokens": 8, "truncate": "left"}])"},
     {"text",
      R"([{"op": "template", "text": "{instruction} {state}"}, {"op": "tokenize", "max_tokens": 8, "truncate": "left"}])"},
     {"state",

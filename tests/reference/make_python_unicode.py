@@ -12,7 +12,7 @@ import unicodedata
 
 from unicode_tables import CODE_POINTS, write_classes, write_lowered
 
-ALNUM, CASED, IGNORABLE = 1, 2, 4
+ALNUM, CASED, IGNORABLE, PRINTABLE = 1, 2, 4, 8
 
 
 def classes() -> list[int]:
@@ -20,7 +20,7 @@ def classes() -> list[int]:
     flags = [0] * 0x110000
     for c in CODE_POINTS:
         ends = [(head + chr(c) + "\u03a3").lower()[-1] == "\u03c2" for head in ("", "a")]
-        flags[c] = ALNUM * chr(c).isalnum() + CASED * ends[0] + IGNORABLE * (ends[1] and not ends[0])
+        flags[c] = ALNUM * chr(c).isalnum() + CASED * ends[0] + IGNORABLE * (ends[1] and not ends[0]) + PRINTABLE * chr(c).isprintable()
     return flags
 
 

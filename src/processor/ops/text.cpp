@@ -138,6 +138,15 @@ struct IfEmptyOp final : TextOp {
   }
 };
 
+/// The text as a list of Python prints it.
+struct PythonListOp final : TextOp {
+  Result<std::string> apply(std::string text, std::span<const int>) const override {
+    std::string out = python::list_of(text);
+    VLA_CHECK(check_prompt(out.size()));
+    return out;
+  }
+};
+
 struct EnsureSuffixOp final : TextOp {
   std::string suffix;
   Result<std::string> apply(std::string text, std::span<const int>) const override {
@@ -182,6 +191,8 @@ Status read(JsonFields& fields, IfEmptyOp& op, Recipe&) {
   VLA_TRY(op.text, read_text(fields, "text"));
   return op.text.empty() ? fields.wrong("text", "a text that is not empty") : Status();
 }
+
+Status read(JsonFields&, PythonListOp&, Recipe&) { return {}; }
 
 Status read(JsonFields& fields, EnsureSuffixOp& op, Recipe&) {
   VLA_TRY(op.suffix, read_text(fields, "suffix"));
@@ -263,6 +274,7 @@ Ops text_ops() {
           {"text", "replace", parse<ReplaceOp>},
           {"text", "refuse", parse<RefuseOp>},
           {"text", "if_empty", parse<IfEmptyOp>},
+          {"text", "python_list", parse<PythonListOp>},
           {"text", "ensure_suffix", parse<EnsureSuffixOp>},
           {"text", "template", parse<TemplateOp>},
           {"text", "views", parse<ViewsOp>},
