@@ -34,7 +34,8 @@ from pathlib import Path
 
 import numpy as np
 from goldens import (
-    act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, openvla, pi, pi0_fast, recorder, rtc, smolvla, turbovla, turbovla_authors, vla_jepa, xvla)
+    act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, groot, openvla, pi, pi0_fast, recorder, rtc, smolvla, turbovla, turbovla_authors,
+    vla_jepa, xvla)
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -462,6 +463,25 @@ def draw_gr00t(arch, seed):
     return gr00t.case(seed, frames, r.choice(("go", "Pick up the red cube!", "naïve café 漢字 n° 5", "word " * 20)), checkpoint, options=options)
 
 
+def draw_groot(release, seed):
+    """The same for GR00T as LeRobot saves it, by the statistics of a data set; frames are squeezed, and texts printed as a list."""
+    r = random.Random(f"groot {release} {seed}")
+    heads, kv, d_head = r.choice(((4, 2, 8), (3, 1, 12), (6, 3, 8), (5, 5, 8), (2, 2, 16)))
+    vl_heads = r.choice((2, 3, 4))
+    d_model, kept, vision_heads = vl_heads * 2 * r.choice((4, 5, 6)), r.choice((4, 5)), r.choice((1, 2, 3))
+    d_state, d_action, size = r.randint(1, 14), r.randint(1, 14), (r.randint(12, 90), r.randint(12, 90))
+    sizes = {view: size for view in r.sample(("front", "wrist", "cam_high", "Top", "hand", "left_wrist"), r.randint(1, 3))}
+    vl = r.choice((1, 2, 3)), vl_heads, d_model // vl_heads
+    head = gr00t.head(kept, (r.randint(2, 7), r.choice((2, 3, 4)), 2 * r.choice((3, 4, 5))), vl, 2 * r.randint(4, 12), d_state + r.randint(0, 4),
+                      d_action + r.randint(0, 4), r.randint(1, 9), num_inference_timesteps=r.choice((1, 2, 4, 5)))
+    tower = vision_heads * 4 * r.choice((2, 3, 4)), r.randint(3, 5), vision_heads, 2 * r.randint(8, 20)
+    text = d_model, kept + r.randint(0, 2), heads, kv, d_head, r.choice((32, 50))
+    more = {"zero_spread": (0,) if r.random() < 0.3 else (), "stored_head": r.random() < 0.5}
+    drawn = groot.DRAWN[release](r, sizes, d_state, d_action, tower, text, head, more)
+    words = r.choice((*TEXTS, "the robot's \"cup\" \\ here", 'a "cup"', "a\u200bb\x7f\u00ad", "", "word " * 20))
+    return cases.Case(seed, groot.frames(drawn.sizes, r.choice(("png", "png", "jpg"))), words, drawn, options=groot.OPTIONS)
+
+
 def add_low_bits(file, seed):
     """Moves every weight by up to half a percent, to float32 numbers such as training leaves."""
     import torch
@@ -518,7 +538,8 @@ def judge_rounding(expected, got, published):
 
 DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "openvla": draw_openvla, "pi0_fast": draw_pi0_fast, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
-    for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
+    for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs} | {
+    f"groot_{release}": functools.partial(draw_groot, release) for release in groot.DRAWN}
 
 
 def compare(arch, seed, vla, folder, dtype):

@@ -16,6 +16,7 @@ FLOAT32 = ["--kernels", "float32"]  # for what is held to the reference's float3
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "tools"))
 from goldens.build import make  # noqa: E402
+from goldens.cases import arguments  # noqa: E402
 
 FOLDER = make()
 NAMES = sorted(str(path.parent.relative_to(FOLDER)) for path in FOLDER.glob("*/*/observation.json"))
@@ -39,7 +40,6 @@ class Golden:
 
     def __init__(self, name):
         self.folder = FOLDER / (name if "/" in name else f"smolvla/{name}")
-        self.arch = self.folder.parent.name
         self.bundle, self.noise, self.expected = (
             self.folder / f for f in ("bundle.gguf", "noise.npy", "expected.gguf")
         )
@@ -49,12 +49,13 @@ class Golden:
         said = self.folder / "convert.json"
         self.said = json.loads(said.read_text(encoding="utf-8")) if said.is_file() else {}
 
+    @property
+    def arch(self):
+        return gguf.GGUFReader(self.bundle).fields["vla.arch"].contents()
+
     def conversion(self):
         """Options of vla-convert for what the checkpoint does not say."""
-        for name, value in self.said.items():
-            yield "--" + name.replace("_", "-")
-            if value is not True:  # a flag stands alone
-                yield ",".join(value) if isinstance(value, list) else str(value)
+        return arguments(self.said, self.folder)
 
     def arguments(self, bundle=None, images=None, state=None, text=None, noise=None, options=("--json",)):
         images = self.images if images is None else images

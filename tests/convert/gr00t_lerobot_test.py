@@ -98,27 +98,49 @@ def test_another_robot_than_the_policys_is_refused(saved):
     assert f"--embodiment: expected {TAG}" in error.message() and error.code == Code.USAGE
 
 
+def test_a_gripper_is_turned_for_libero_as_the_config_says_whatever_the_step_says(saved):
+    saved.config["action_decode_transform"] = "libero"
+    gripper = {"columns": [1]}
+    ends = [{"op": "affine", **gripper, "scale": -2.0, "shift": 1.0}, {"op": "sign", **gripper}]
+    assert json.loads(saved.convert().keys["processor.recipe"])["action"][-2:] == ends
+    saved.config["action_decode_transform"], saved.decode["action_decode_transform"] = None, "libero"
+    assert json.loads(saved.convert().keys["processor.recipe"])["action"][-1] != ends[-1]
+    assert "action_decode_transform of config.json" in refused_gripper(saved)
+
+
+def refused_gripper(saved):
+    saved.config["action_decode_transform"] = "libero"
+    return saved.refusal(gripper_sign="gripper").message()
+
+
+def test_without_albumentations_frames_become_squares_and_a_camera_is_no_option(saved):
+    saved.encode["use_albumentations"] = False
+    assert json.loads(saved.convert().keys["processor.recipe"])["image"][:2] == [
+        {"op": "crop_fraction", "fraction": 1.0}, {"op": "resize", "width": 12, "height": 12, "filter": "torch_bicubic_16bit"}]
+    assert "--camera-size" in saved.refusal(camera_size="40x30").message()
+
+
+def test_a_robot_that_no_mapping_names_is_the_first_one(saved):
+    saved.pack["embodiment_mapping"] = {"other": 2}
+    first = saved.tensors["_groot_model.action_head.state_encoder.layer1.W"][0].T
+    assert np.array_equal(saved.convert().tensors["state_in.weight"], first)
+
+
 def renamed(saved):
     saved.before["rename_observations_processor"]["rename_map"] = {"observation.images.a": "observation.images.front"}
-
-
-def of_data_set(saved):
-    saved.after = {"groot_action_unpack_unnormalize_v2": {}, "device_processor": {}}
 
 
 @pytest.mark.parametrize(
     "change, message",
     [
         (renamed, "rename_map: expected {}"),
-        (of_data_set, "actions are normalized by the data set's statistics"),
         (lambda s: s.config.update(lora_rank=8), "lora_rank: expected 0"),
         (lambda s: s.config.update(strange=1), "strange"),
-        (lambda s: s.decode.update(action_decode_transform="libero"), "action_decode_transform: expected None"),
+        (lambda s: (s.config.update(action_decode_transform="libero"), s.decode.update(env_action_dim=1)), "an action key gripper of one number"),
         (lambda s: s.decode.update(use_percentiles=False), "use_percentiles: expected the same as of groot_n1_7_pack_inputs_v1"),
         (lambda s: s.pack.update(raw_stats=None), "raw_stats: expected a value"),
         (lambda s: s.pack.update(normalize_min_max=False), "normalize_min_max: expected True"),
         (lambda s: s.pack.update(video_modality_keys=["wrist", "front"]), "video_modality_keys: expected those of modality_config"),
-        (lambda s: s.encode.update(use_albumentations=False), "use_albumentations: expected True"),
         (lambda s: s.encode.update(sharpen=True), "sharpen"),
         (lambda s: s.tensors.pop(next(iter(s.tensors))), "found none"),
     ],
@@ -130,4 +152,4 @@ def test_what_lerobot_does_otherwise_is_refused_by_name(saved, change, message):
 
 def test_the_first_release_of_the_type_is_told(saved):
     saved.before = {"groot_pack_inputs_v3": {}}
-    assert "GR00T N1.5 of LeRobot up to 0.5.1" in saved.refusal().message()
+    assert "expected rename_observations_processor, to_batch_processor, groot_pack_inputs_v3" in saved.refusal().message()

@@ -76,10 +76,15 @@ def write_observation(case, folder):
 def conversion_options(folder):
     """The options of vla-convert that a case's convert.json names."""
     file = folder / "convert.json"
-    for name, value in (json.loads(file.read_text()) if file.is_file() else {}).items():
+    return arguments(json.loads(file.read_text()) if file.is_file() else {}, folder)
+
+
+def arguments(said, folder):
+    """Options of vla-convert by their names. `folder`: the case's, in which a base lies."""
+    for name, value in said.items():
         yield "--" + name.replace("_", "-")
         if value is not True:  # a flag
-            yield ",".join(value) if isinstance(value, list) else str(value)
+            yield ",".join(value) if isinstance(value, list) else str(folder / value if name == "base" else value)
 
 
 def backbone_folder(checkpoint):

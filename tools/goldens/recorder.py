@@ -81,7 +81,7 @@ def open_reference():
 
 
 def versions() -> str:
-    found = {d.name.lower(): d.version for d in importlib.metadata.distributions() if d.name}
+    found = {d.name.lower(): d.version for d in reversed([*importlib.metadata.distributions()]) if d.name}  # the first one is imported
     return ", ".join(f"{name} {found[name]}" for name in PACKAGES if name in found)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import glob
 import os
 from dataclasses import dataclass, field
-from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Tuple
+from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Tuple
 
 import numpy as np
 
@@ -57,6 +57,7 @@ class Checkpoint:
     base: str = ""  # the folder of the policy that this one, or an adapter, was trained from
     adapter: Optional[Adapter] = None
     documents: Dict[str, dict] = field(default_factory=dict)  # by name, what stands in the place of JSON files
+    vectors: Any = None  # of LeRobot's GR00T, a robot whose states and actions are one vector each: archs/gr00t/lerobot_files.py
     degraded: List[str] = field(default_factory=list)  # features that pass unnormalized because --identity-stats allows it
 
     def path(self, name: str) -> str:

@@ -46,6 +46,7 @@ BACKBONE_PATTERNS = [
     "merges.txt",
     "added_tokens.json",
     "preprocessor_config.json",
+    "processor_config.json",
     "chat_template.*",
 ]
 ACTION_TOKENIZER_PATTERNS = ["processor_config.json", "tokenizer.json", "tokenizer_config.json", "bpe_tokenizer/*.json"]

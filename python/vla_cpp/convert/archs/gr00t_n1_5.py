@@ -24,7 +24,7 @@ from ..networks import MAX_LAYERS
 from ..options import variant
 from ..section import Fixed, Section
 from . import Options, Plan
-from .gr00t import head
+from .gr00t import head, lerobot_n1_5
 from .gr00t.eagle import EAGLE_2_5
 from .gr00t.images import STANDARDIZE, Images
 from .gr00t.plan import Parts, assemble, network_keys_of
@@ -136,6 +136,8 @@ CONFIGS = {
 
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    if checkpoint.vectors:
+        return _plan_of_lerobot(checkpoint, options, problems)
     config = _data_config(checkpoint, options.variant)
     robots = read_json(checkpoint.path(METADATA))
     metadata = choose(robots, options.embodiment)
@@ -150,12 +152,26 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     robot = _robot(config, metadata, s.horizon, problems)
     images = _images(config, metadata, s, problems)
     problems.raise_any()
-    parts = Parts(EAGLE_2_5, folder, robot, images, formalize=False)
+    parts = Parts(EAGLE_2_5, folder, robot, images, [])
+    return assemble(parts, network_keys(s, n_future), weights(s, n_future), checkpoint, options, s, problems)
+
+
+def _plan_of_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    vectors = checkpoint.vectors
+    folder = find_backbone(checkpoint, options.backbone, vectors.config.get("tokenizer_assets_repo"), "tokenizer_assets_repo")
+    s, n_future = read_sizes(checkpoint.config, folder, problems)
+    s.max_views, s.embodiment = len(vectors.views), vectors.index
+    if not 0 <= s.embodiment < s.n_embodiment:
+        where = "{}: embodiment_mapping: {}".format(lerobot_n1_5.PACK, options.embodiment)
+        problems.add(where, "an index below max_num_embodiments {}".format(s.n_embodiment), str(s.embodiment))
+    images = lerobot_n1_5.read_images(folder, s, problems)
+    problems.raise_any()
+    parts = Parts(EAGLE_2_5, folder, vectors.robot(s.horizon), images, lerobot_n1_5.text_ops())
     return assemble(parts, network_keys(s, n_future), weights(s, n_future), checkpoint, options, s, problems)
 
 
 def embodiments(checkpoint: Checkpoint) -> List[str]:
-    """Tags of the robots that the checkpoint describes."""
+    """Tags of the robots that the checkpoint of the authors describes."""
     return list(read_json(checkpoint.path(METADATA)))
 
 

@@ -14,7 +14,7 @@ from typing import List, NamedTuple, Tuple
 from ...errors import Code, Problems, refuse
 from ...section import Section
 from .. import Options
-from .robot import DOCS
+from .robot import DOCS, PROCESSOR
 
 # In bytes: the reference folds the rescaling by 1 / 255 into mean and std, which then are exact.
 STANDARDIZE = {"op": "standardize", "mean": [0.5] * 3, "std": [0.5] * 3, "arithmetic": "float32_in_bytes"}
@@ -64,6 +64,27 @@ def read_images(processor: Section, area: Area, options: Options, notes: List[st
             )
         )
     return Images(width, height, ops)
+
+
+def read_square_images(processor: Section, area: Area, options: Options, notes: List[str], problems: Problems) -> Images:
+    """LeRobot's pipeline without albumentations: frames of any aspect become squares, which are cropped and enlarged again."""
+    if options.camera_size:
+        raise refuse("--camera-size", "no such option", options.camera_size, "frames of any size become squares of this policy", Code.USAGE)
+    target, edge = _pair(processor, "image_target_size"), _edge(processor)
+    stated = processor.get("crop_fraction") is not None or processor.get("image_crop_size") is not None
+    side = max(1, round(edge * _fraction(processor))) if stated else edge
+    resize = {"op": "resize", "filter": "torch_bicubic_16bit"}
+    pad = options.letterbox or processor.get("letter_box_transform") is True
+    # A resize that came first would end the pipeline.
+    ops: List[dict] = [{"op": "square_pad"} if pad else {"op": "crop_fraction", "fraction": 1.0}, {**resize, "width": edge, "height": edge}]
+    if side < edge:
+        ops.append({"op": "crop_fraction", "fraction": (side + 0.5) / edge})
+    if side != target:
+        ops.append({**resize, "width": target, "height": target})
+    width, height = held_size(target, target, area, PROCESSOR + ": image_target_size", problems)
+    if width != target:
+        ops.append({"op": "resize", "width": width, "height": height, "filter": area.filter})
+    return Images(width, height, [*ops, {"op": "size", "width": width, "height": height}, STANDARDIZE])
 
 
 def _pair(processor: Section, key: str) -> int:

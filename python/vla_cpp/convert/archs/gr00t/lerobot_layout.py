@@ -1,139 +1,195 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""GR00T N1.7 as LeRobot saves it, `type: groot`: what the authors' files would say.
+"""GR00T as LeRobot saves it, `type: groot`: what the authors' files would say. Of N1.5 it is in lerobot_n1_5.py, of N1.7 here.
 
 LeRobot's class has the network under one attribute. Its sizes are those of the base, the policy that was fine-tuned. Cameras, states,
-actions and statistics stand in the steps of the pipelines.
+actions and statistics stand in the steps of the pipelines: those of GR00T, key by key, where the base has them for the robot, or else those
+of the data set, for states and actions as one vector each.
 Reference: lerobot policies/groot/modeling_groot.py, processor_groot.py and configuration_groot.py of 0.6.1.
 """
 
 from __future__ import annotations
 
 import os
-from typing import Dict, List
+import re
+from typing import Any, Dict, List
 
 from ...checkpoint import Checkpoint
-from ...errors import Code, Problems, refuse
+from ...errors import Problems
 from ...files import member, read_json
-from ...hub import HUB_FORM
+from ...hub import HUB_NAME
 from ...section import Fixed, Section
 from .. import Options
-from .robot import EMBODIMENTS, PROCESSOR, STATISTICS
+from . import lerobot_files as files
+from . import lerobot_n1_5
+from .lerobot_files import BATCH, CONFIG, DEVICE, IMAGES, RENAME, Step, Vectors
+from .robot import EMBODIMENTS, END, PROCESSOR, STATISTICS
 
-ARCH, PREFIX = "gr00t_n1_7", "_groot_model."
-CONFIG, PRE, POST = "config.json", "policy_preprocessor.json", "policy_postprocessor.json"
-RENAME, PACK, ENCODE, DECODE = (
-    "rename_observations_processor",
+ARCH = "gr00t_n1_7"
+PACK, ENCODE, DECODE, UNPACK = (
     "groot_n1_7_pack_inputs_v1",
     "groot_n1_7_vlm_encode_v1",
     "groot_n1_7_action_decode_v1",
+    "groot_action_unpack_unnormalize_v2",
 )
-STEPS = {PRE: [RENAME, "to_batch_processor", PACK, ENCODE, "device_processor"], POST: [DECODE, "device_processor"]}
-CONFIG_FIXED: Fixed = {"n_obs_steps": (1, 1), "lora_rank": (0, 0), "use_peft": (False, False)}
-# Of training, of this machine and of the hub, and what the steps state once more.
-CONFIG_IGNORED = set(
-    """type input_features output_features device use_amp push_to_hub repo_id private tags license pretrained_path pretrained_revision
-    chunk_size n_action_steps max_state_dim max_action_dim normalization_mapping base_model_path embodiment_tag tune_llm tune_visual
-    tune_projector tune_diffusion_model tune_vlln tune_top_llm_layers num_inference_timesteps rtc_ramp_rate use_flash_attention
-    use_relative_actions relative_exclude_joints optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay warmup_ratio use_bf16
-    model_params_fp32 image_size tokenizer_assets_repo lora_alpha lora_dropout lora_full_model video_backend balance_dataset_weights
-    balance_trajectory_weights dataset_paths output_dir save_steps max_steps batch_size dataloader_num_workers report_to resume
-    action_decode_transform rtc_config""".split()
-)
+BEFORE, AFTER = [RENAME, BATCH, PACK, ENCODE, DEVICE], [[DECODE, DEVICE], [UNPACK, DEVICE]]
 PACK_FIXED: Fixed = {"state_horizon": (1, 1), "language_key": ("task", "task"), "normalize_min_max": (True, True)}
 PACK_READ = """formalize_language embodiment_tag embodiment_mapping clip_outliers use_percentiles video_modality_keys raw_stats modality_config
     max_state_dim max_action_dim""".split()
-# Of training's masks and noise; and how many moments of the cameras there are, which modality_config lists.
-PACK_IGNORED = {"action_horizon", "valid_action_horizon", "state_dropout_prob", "video_horizon"}
+OF_GR00T = ("raw_stats", "modality_config", "video_modality_keys")  # of which there are none beside a data set's statistics
+# Of training's masks and noise.
+PACK_IGNORED = {"action_horizon", "valid_action_horizon", "state_dropout_prob"}
 ENCODE_READ = ("image_crop_size", "image_target_size", "shortest_image_edge", "crop_fraction", "use_albumentations", "letter_box_transform")
 DECODE_READ = ("env_action_dim", "raw_stats", "modality_config", "use_percentiles", "use_relative_action", "action_decode_transform")
-OTHERS = {  # steps by which other releases and other ways of training are told
-    "groot_action_unpack_unnormalize": "its actions are normalized by the data set's statistics as one vector",
-    "groot_pack_inputs": "GR00T N1.5 of LeRobot up to 0.5.1",
-    "relative_actions_processor": "its actions are made relative outside of GR00T's own statistics",
-}
+UNPACK_FIXED: Fixed = {"normalize_min_max": (True, True)}
+# The transform of the gripper is that of config.json, whatever the steps say (_apply_groot_action_decode_transform).
+UNPACK_READ = {"env_action_dim", "clip_normalized_action", "libero_gripper_action", "libero_gripper_binarize"}
+OLD_DEFAULTS = {"chunk_size": 50, "n_action_steps": 50}  # of N1.5, for which GrootConfig takes the new one
+NEW_DEFAULT = 40
+TRANSFORMS = {"none": "", "": "", "libero": "libero"}
 
 
 def as_published(checkpoint: Checkpoint, options: Options) -> Options:
     """Makes of LeRobot's checkpoint one of the authors' layout. Returns the options, with the only robot that there is."""
+    if lerobot_n1_5.is_n1_5(checkpoint):
+        return lerobot_n1_5.as_published(checkpoint, options)
     problems = Problems(checkpoint.name)
-    steps = _steps(checkpoint)
-    pack, encode, decode = (Section("{}: {}".format(PRE if name != DECODE else POST, name), steps[name], {}, problems) for name in (PACK, ENCODE, DECODE))
-    _check(checkpoint.config, steps, pack, encode, decode, problems)
-    problems.raise_any()
-    tag, robot = pack.get("embodiment_tag"), dict(member(pack.values, "modality_config", dict, pack.where))
-    robot["action"] = _cut(member(robot, "action", dict, pack.where), checkpoint.config)
+    steps = files.read_steps(checkpoint, BEFORE, AFTER, problems)
+    pack, encode = (files.section(steps[name], problems) for name in (PACK, ENCODE))
+    _check(checkpoint.config, pack, encode)
     settings = {name: encode.get(name) for name in ENCODE_READ}
     settings |= {name: pack.get(name) for name in ("formalize_language", "clip_outliers", "use_percentiles", "max_state_dim")}
-    settings |= {"use_relative_action": decode.get("use_relative_action"), "modality_configs": {tag: robot}}
-    checkpoint.documents = {
-        PROCESSOR: {"processor_class": "Gr00tN1d7Processor", "processor_kwargs": settings},
-        STATISTICS: {tag: pack.get("raw_stats")},
-        EMBODIMENTS: member(pack.values, "embodiment_mapping", dict, pack.where),
-    }
+    read = _keys if DECODE in steps else _vectors
+    robot, statistics = read(checkpoint, steps, pack, settings, options, problems)
+    problems.raise_any()
+    tag = pack.get("embodiment_tag")
+    settings["modality_configs"] = {tag: robot}
+    checkpoint.documents.update(
+        {
+            PROCESSOR: {"processor_class": "Gr00tN1d7Processor", "processor_kwargs": settings},
+            STATISTICS: {tag: statistics},
+            EMBODIMENTS: {tag: files.robot_index(pack)},
+        }
+    )
     own = {name: checkpoint.config[name] for name in ("num_inference_timesteps", "rtc_ramp_rate") if checkpoint.config.get(name) is not None}
-    checkpoint.config, checkpoint.layout = {**_base_config(checkpoint), **own}, ARCH
-    checkpoint.tensors = {name[len(PREFIX) :]: entry._replace(name=name[len(PREFIX) :]) for name, entry in checkpoint.tensors.items()}
-    checkpoint.aliases = {name[len(PREFIX) :]: other[len(PREFIX) :] for name, other in checkpoint.aliases.items()}
-    if options.embodiment not in ("", tag):
-        raise refuse("--embodiment", "{}, the only robot of this policy".format(tag), options.embodiment, code=Code.USAGE)
-    return options.replaced(embodiment=tag)
+    files.take_over(checkpoint, ARCH, {**files.base_config(checkpoint), **own})
+    return files.check_robot(options, tag)
 
 
-def _steps(checkpoint: Checkpoint) -> Dict[str, dict]:
-    """The settings of the steps by their names. Errors: unsupported for other steps than those of N1.7."""
-    found: Dict[str, dict] = {}
-    base = str(checkpoint.config.get("base_model_path"))
-    if "n1.5" in base.lower():
-        raise refuse("config.json: base_model_path", "GR00T N1.7", base, OTHERS["groot_pack_inputs"], Code.UNSUPPORTED)
-    if checkpoint.processors is None:
-        raise refuse(checkpoint.path(PRE), "LeRobot's pipelines", "none", "save the policy with its processors", Code.UNSUPPORTED)
-    for (file, wanted), pipeline in zip(STEPS.items(), checkpoint.processors):
-        steps = [step if isinstance(step, dict) else {} for step in member(pipeline, "steps", list, file)]
-        names: List[str] = [str(step.get("registry_name")) for step in steps]
-        if names != wanted:
-            other = next((why for name, why in OTHERS.items() if any(n.startswith(name) for n in names)), "")
-            raise refuse(file + ": steps", ", ".join(wanted), ", ".join(names)[:300], other, Code.UNSUPPORTED)
-        found.update({name: member(step, "config", dict, file) for name, step in zip(names, steps)})
-    return found
-
-
-def _check(config: dict, steps: Dict[str, dict], pack: Section, encode: Section, decode: Section, problems: Problems) -> None:
-    policy = Section(CONFIG, config, {}, problems)
-    policy.refuse_unknown({*CONFIG_FIXED, *CONFIG_IGNORED})
-    policy.check_fixed(CONFIG_FIXED)
-    pack.refuse_unknown({*PACK_FIXED, *PACK_READ, *PACK_IGNORED})
+def _check(config: dict, pack: Section, encode: Section) -> None:
+    policy = Section(CONFIG, config, {}, pack.problems)
+    policy.refuse_unknown({*files.CONFIG_FIXED, *files.CONFIG_IGNORED})
+    policy.check_fixed(files.CONFIG_FIXED)
+    pack.refuse_unknown({*PACK_FIXED, *PACK_READ, *PACK_IGNORED, "video_horizon"})
     pack.check_fixed(PACK_FIXED)
     encode.refuse_unknown({*ENCODE_READ, "model_name", "device"})
+
+
+def _keys(checkpoint: Checkpoint, steps: Dict[str, Step], pack: Section, settings: Dict[str, Any], options: Options, problems: Problems) -> tuple:
+    """The modalities and statistics of GR00T."""
+    decode = files.section(steps[DECODE], problems)
     decode.refuse_unknown(DECODE_READ)
-    if decode.get("action_decode_transform") is not None:
-        hint = "convert the gripper by --gripper-sign from a policy without one"
-        decode.bad("action_decode_transform", "None", hint=hint, unsupported=True)
-    if steps[RENAME].get("rename_map"):
-        problems.unsupported(PRE + ": rename_map", "{}, since cameras are found by the checkpoint's names", str(steps[RENAME]["rename_map"])[:120])
     for name in PACK_READ:
         if pack.get(name) is None:
             pack.bad(name, "a value", hint="the policy was saved without GR00T's own statistics", unsupported=True)
     for name in ("modality_config", "use_percentiles", "raw_stats"):
         if name in decode.values and decode.get(name) is not None and decode.get(name) != pack.get(name):
             decode.bad(name, "the same as of " + PACK, "another")
-    robot = pack.get("modality_config")
-    video = robot.get("video") if isinstance(robot, dict) else None
+    robot = dict(member(pack.values, "modality_config", dict, pack.where))
+    video = robot.get("video")
     if isinstance(video, dict) and video.get("modality_keys") != pack.get("video_modality_keys"):
         pack.bad("video_modality_keys", "those of modality_config")
+    action = member(robot, "action", dict, pack.where)
+    delta = action.get("delta_indices")
+    if isinstance(delta, list):
+        robot["action"] = {**action, "delta_indices": delta[: min([len(delta), *_limits(checkpoint.config)])]}
+    settings["use_relative_action"] = decode.get("use_relative_action")
+    if _transform(checkpoint.config, options, problems):
+        _add_gripper(checkpoint, _gripper(action, pack, decode, problems))
+    return robot, pack.get("raw_stats")
 
 
-def _cut(action: dict, config: dict) -> dict:
-    """LeRobot answers no more rows than chunk_size and n_action_steps."""
-    steps = action.get("delta_indices")
-    limits = [n for n in (config.get("chunk_size"), config.get("n_action_steps")) if type(n) is int and n > 0]
-    return {**action, "delta_indices": steps[: min([len(steps), *limits])]} if isinstance(steps, list) else action
+def _gripper(action: dict, pack: Section, decode: Section, problems: Problems) -> int:
+    """The column of the key "gripper", which must have one number."""
+    start, statistics = 0, member(member(pack.values, "raw_stats", dict, pack.where), "action", dict, pack.where)
+    for key in member(action, "modality_keys", list, pack.where):
+        stated = statistics.get(key)
+        width = len(stated.get("min") or ()) if isinstance(stated, dict) else 0
+        if key == "gripper" and width == 1 and not 0 < decode.count("env_action_dim", minimum=0) <= start:
+            return start
+        start += width
+    problems.unsupported(CONFIG + ": action_decode_transform", "none, or an action key gripper of one number", "libero")
+    return 0
 
 
-def _base_config(checkpoint: Checkpoint) -> dict:
-    path = os.path.join(checkpoint.base, CONFIG) if checkpoint.base else ""
-    if os.path.isfile(path):
-        return read_json(path)
-    named = str(checkpoint.config.get("base_model_path"))[:100]
-    hint = "--base DIR or {} with the config.json of {}".format(HUB_FORM, named)
-    raise refuse(checkpoint.path(CONFIG), "the sizes of the network, which are those of the policy that was fine-tuned", "none", hint, Code.IO)
+def _vectors(checkpoint: Checkpoint, steps: Dict[str, Step], pack: Section, settings: Dict[str, Any], options: Options, problems: Problems) -> tuple:
+    """A robot of one vector by the statistics of a data set; its modalities and statistics are not those that GR00T's files state."""
+    config, unpack = checkpoint.config, files.section(steps[UNPACK], problems)
+    files.refuse_options(options, {"gripper_sign": "the gripper is one of the numbers of an action; action_decode_transform of config.json states its sign"})
+    unpack.refuse_unknown({*UNPACK_FIXED, *UNPACK_READ})
+    unpack.check_fixed(UNPACK_FIXED)
+    clips = [section.get(name) for section, name in ((pack, "clip_outliers"), (unpack, "clip_normalized_action"))]
+    if not all(isinstance(value, bool) for value in clips):
+        unpack.bad("clip_normalized_action", "true or false, as clip_outliers", str(clips))
+    if config.get("use_relative_actions"):
+        problems.unsupported(CONFIG + ": use_relative_actions", "False, since no step makes actions relative", "True")
+    if pack.get("video_horizon") not in (None, 1):
+        pack.bad("video_horizon", "None or 1", hint="LeRobot repeats the frame of now", unsupported=True)
+    state = files.state_group(checkpoint, config, steps[PACK], clips[0] is True, problems)
+    width = files.action_width(config, unpack)
+    action = files.action_group(checkpoint, steps[UNPACK], width, clips[1] is True, problems)
+    views = _views(config, pack, checkpoint.notes, problems)
+    limits = [*_limits(config), *_limit_of_base(checkpoint, pack)]
+    checkpoint.vectors = Vectors(config, views, state, action, files.robot_index(pack), min([1 << 16, *limits]))
+    if _transform(config, options, problems) and width >= 7:
+        _add_gripper(checkpoint, width - 1)
+    settings["use_relative_action"] = False
+    return {"video": {"modality_keys": views, "delta_indices": [0]}, "state": {"delta_indices": [0]}}, {}
+
+
+def _views(config: dict, pack: Section, notes: List[str], problems: Problems) -> List[str]:
+    views, keys = files.cameras(config, notes, problems), pack.get("video_modality_keys")
+    if keys is None:
+        return views
+    named = [IMAGES + str(key) for key in keys] if isinstance(keys, list) else []
+    if not named or not set(named) <= set(views):
+        pack.bad("video_modality_keys", "None, or some of the cameras " + ", ".join(views), unsupported=True)
+        return views
+    return named
+
+
+def _transform(config: dict, options: Options, problems: Problems) -> str:
+    """What is done to the gripper in the end: for LIBERO's simulator its sign, unless the config says otherwise."""
+    stated = config.get("action_decode_transform", "auto")
+    if stated == "auto":
+        stated = "libero" if config.get("embodiment_tag") == "libero_sim" else None
+    found = TRANSFORMS.get(str(stated or "").lower())
+    if found is None:
+        problems.unsupported(CONFIG + ": action_decode_transform", "auto, none or libero", repr(stated))
+    if found:
+        files.refuse_options(options, {"gripper_sign": "action_decode_transform of config.json turns the gripper already"})
+    return found or ""
+
+
+def _add_gripper(checkpoint: Checkpoint, column: int) -> None:
+    """-sign(2 g - 1) of a gripper g."""
+    ops = [{"op": "affine", "columns": [column], "scale": -2.0, "shift": 1.0}, {"op": "sign", "columns": [column]}]
+    checkpoint.documents[END] = {"ops": ops}
+
+
+def _limits(config: dict) -> List[int]:
+    """LeRobot answers no more rows than chunk_size and n_action_steps, of which it replaces the defaults of N1.5."""
+    found = {name: config.get(name, NEW_DEFAULT) for name in OLD_DEFAULTS}
+    return [NEW_DEFAULT if n == OLD_DEFAULTS[name] else n for name, n in found.items() if type(n) is int and n > 0]
+
+
+def _limit_of_base(checkpoint: Checkpoint, pack: Section) -> List[int]:
+    """Nor than the base has steps for the robot, where LeRobot finds its files: in a folder, and not under a name of the hub."""
+    path = os.path.join(checkpoint.base, PROCESSOR) if checkpoint.base else ""
+    named = str(checkpoint.config.get("base_model_path") or "nvidia/")
+    if re.fullmatch(HUB_NAME, named) or not os.path.isfile(path):
+        return []
+    configs = member(member(read_json(path), "processor_kwargs", dict, PROCESSOR), "modality_configs", dict, PROCESSOR)
+    robot = configs.get(checkpoint.config.get("embodiment_tag"))
+    steps = robot.get("action", {}).get("delta_indices") if isinstance(robot, dict) and isinstance(robot.get("action"), dict) else None
+    return [len(steps)] if isinstance(steps, list) and steps else []

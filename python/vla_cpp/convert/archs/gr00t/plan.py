@@ -7,7 +7,7 @@ The two differ in their backbone and in what their configs may say: that is a `R
 
 from __future__ import annotations
 
-from typing import Any, Collection, Dict, List, NamedTuple
+from typing import Any, Collection, Dict, List, NamedTuple, Sequence
 
 from ... import recipe
 from ...bundle import Key
@@ -20,9 +20,9 @@ from ...section import Fixed, Section
 from ...tokenizer import read_tokenizer
 from .. import Options, Plan
 from . import head
-from .images import Images, read_images
-from .prompt import text_ops
-from .robot import PROCESSOR, STATISTICS, Robot, choose, embodiment_index, processor_file, read_robot
+from .images import Images, read_images, read_square_images
+from .prompt import FORMALIZE, LEROBOT_EMPTY, text_ops
+from .robot import END, PROCESSOR, STATISTICS, Robot, choose, embodiment_index, processor_file, read_robot
 from .sizes import Sizes
 from .vectors import action_ops, feature_description, gripper_ops, state_ops, statistics_of
 
@@ -114,7 +114,11 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     s = read_sizes(release, checkpoint.config, folder, problems)
     s.embodiment = embodiment_index(checkpoint, options.embodiment, release.embodiments, s.n_embodiment, problems)
     statistics = processor_file(checkpoint, STATISTICS)
-    robot = read_robot(options.embodiment, robot_config, statistics, processor, s.horizon, problems)
+    robot = (
+        checkpoint.vectors.robot(s.horizon)
+        if checkpoint.vectors
+        else read_robot(options.embodiment, robot_config, statistics, processor, s.horizon, problems)
+    )
     if not release.cuts_rows:
         _check_horizon(robot_config, s, options, problems)
     problems.raise_any()
@@ -125,11 +129,12 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
         where = "{}: {}.state: delta_indices".format(PROCESSOR, options.embodiment)
         problems.add(where, "state_history_length {} moments".format(s.state_history), str(robot.n_moment))
     area = backbone.read_area(folder, s, problems)
-    images = read_images(processor, area, options, checkpoint.notes, problems)
+    images = (read_images if processor.get("use_albumentations") else read_square_images)(processor, area, options, checkpoint.notes, problems)
     if processor.count("max_state_dim") * s.state_history != s.d_state:
         processor.bad("max_state_dim", "{} as in config.json".format(s.d_state // s.state_history))
     s.image_width, s.image_height = images.width, images.height
-    parts = Parts(backbone, folder, robot, images, processor.get("formalize_language"))
+    clean = [*([LEROBOT_EMPTY] if checkpoint.documents else []), *(FORMALIZE if processor.get("formalize_language") else [])]
+    parts = Parts(backbone, folder, robot, images, clean, checkpoint.documents.get(END, {}).get("ops", ()))
     return assemble(parts, network_keys(release, s), weights(release, s), checkpoint, options, s, problems)
 
 
@@ -157,7 +162,8 @@ class Parts(NamedTuple):
     folder: str  # the backbone's
     robot: Robot
     images: Images
-    formalize: bool  # instructions are cleaned
+    clean: List[dict]  # ops on the instruction
+    end: Sequence[dict] = ()  # ops behind those of the actions
 
 
 def assemble(parts: Parts, keys: List[Key], rows: Rows, checkpoint: Checkpoint, options: Options, s: Sizes, problems: Problems) -> Plan:
@@ -168,16 +174,17 @@ def assemble(parts: Parts, keys: List[Key], rows: Rows, checkpoint: Checkpoint, 
     prompt = backbone.read_prompt(tokenizer, parts.folder, s, problems)
     document = {
         "image": parts.images.ops,
-        "text": text_ops(backbone.TEMPLATE, parts.formalize, prompt, s, bool(checkpoint.documents)),
+        "text": text_ops(backbone.TEMPLATE, parts.clean, prompt, s),
         "state": state_ops(robot, s, problems),
-        "action": action_ops(robot, s, problems),
+        "action": [*action_ops(robot, s, problems), *parts.end],
     }
     if options.gripper_sign:
         document["action"] += gripper_ops(robot, options.gripper_sign, problems)
+    described = checkpoint.vectors.keys(checkpoint, robot.n_row, options, problems) if checkpoint.vectors else None
     all_keys = [
         *keys,
         *prompt.keys(),
-        *feature_description(robot, options, checkpoint.notes, problems),
+        *(described or feature_description(robot, options, checkpoint.notes, problems)),
         *tokenizer.keys,
         recipe.recipe_key(document),
     ]
@@ -193,7 +200,10 @@ def _processor(release: Release, checkpoint: Checkpoint, problems: Problems) -> 
         problems.unsupported(PROCESSOR + ": processor_class", repr(name), repr(config.get("processor_class")))
     section = Section(PROCESSOR, member(config, "processor_kwargs", dict, PROCESSOR), KWARGS, problems)
     fixed = {**KWARGS_FIXED, "model_type": (release.backbone_type,) * 2}
-    section.refuse_unknown({*KWARGS, *STATED, *fixed, *KWARGS_IGNORED})
+    if checkpoint.documents:  # of LeRobot, which has a pipeline of its own where it is false
+        del fixed["use_albumentations"]
+        section.defaults["use_albumentations"] = False
+    section.refuse_unknown({*KWARGS, *STATED, *KWARGS_FIXED, *fixed, *KWARGS_IGNORED})
     section.check_fixed(fixed)
     for key in STATED:
         if key not in section.values:

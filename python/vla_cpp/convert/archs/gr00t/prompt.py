@@ -47,13 +47,15 @@ class Prompt(NamedTuple):
         ]
 
 
-# What LeRobot's N1.7 reads in place of an empty instruction (policies/groot/utils.py, prepare_n1_7_language_batch); the authors' code reads that.
+# What LeRobot reads in place of an empty instruction (policies/groot/processor_groot.py); the authors' code reads that.
 LEROBOT_EMPTY = {"op": "if_empty", "text": "Perform the task."}
 
 
-def text_ops(template: Template, formalize: bool, prompt: Prompt, s: Sizes, of_lerobot: bool) -> List[dict]:
-    clean = [LEROBOT_EMPTY] if of_lerobot else []
-    clean += [{"op": "lower"}, {"op": "drop_punctuation"}] if formalize else []
+FORMALIZE = [{"op": "lower"}, {"op": "drop_punctuation"}]
+
+
+def text_ops(template: Template, clean: List[dict], prompt: Prompt, s: Sizes) -> List[dict]:
+    """`clean`: what is done to the instruction before it stands in the prompt."""
     view = {"open": template.open, "token": template.token, "repeat": s.n_view_token, "close": template.close}
     place = {"place": "back"} if template.behind else {}
     return [

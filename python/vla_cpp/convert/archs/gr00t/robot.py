@@ -19,6 +19,7 @@ from ...options import Option
 from ...section import Section
 
 PROCESSOR, STATISTICS, EMBODIMENTS = "processor_config.json", "statistics.json", "embodiment_id.json"
+END = "ops behind those of the actions"  # a document of LeRobot's checkpoints
 DOCS = "docs/converting.md, GR00T"
 MODALITY = {"delta_indices", "modality_keys", "sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"}
 NAMES = {"min", "max", "mean", "std", "q01", "q99"}  # statistics of a key
