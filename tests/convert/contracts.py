@@ -9,14 +9,14 @@ keys of robots with their widths and modes.  Widths of layers are small ones of 
 import json
 import re
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax_checkpoint
 import numpy as np
-from goldens import act, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, smolvla
+from goldens import act, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, groot, pi, smolvla
 from goldens.cases import Case, backbone_folder, conversion_options, write_checkpoint
-from goldens.files import write_json, write_safetensors
+from goldens.files import write_json
 from vla_cpp.convert import cli
 from vla_cpp.convert.dtypes import to_f32
 from vla_cpp.convert.safetensors_file import read_safetensors
@@ -162,20 +162,9 @@ def as_openpi(row, checkpoint, folder):
 
 
 def groot_case(row):
-    return Case(7, frames_of(row), TEXT, Named(row))
-
-
-@dataclass(frozen=True)
-class Named:
-    """A checkpoint that is refused for what its config.json says: no weights are made."""
-
-    row: dict
-
-    def write(self, seed, folder):
-        inputs = {key: {"type": "STATE" if key == STATE else "VISUAL", "shape": shape} for key, shape in self.row["inputs"].items()}
-        outputs = {"action": {"type": "ACTION", "shape": [self.row["action"]]}}
-        write_json(folder / "config.json", {"type": self.row["family"], "input_features": inputs, "output_features": outputs} | self.row["config"])
-        write_safetensors(folder / "model.safetensors", {"_groot_model.action_head.vlln.weight": np.ones(8, np.float32)})
+    head = gr00t.head(3, (4, 4, 9), (1, 5, 8), 20, row["config"]["max_state_dim"], row["config"]["max_action_dim"], 16)
+    checkpoint = groot.n1_5(views_of(row), *widths(row), gr00t_n1_5.vision(24, 2, 3, 40, 224, 56), gr00t_n1_5.text(40, 4, 6, 2, 12, 56), head)
+    return Case(7, frames_of(row), TEXT, checkpoint, options=groot.OPTIONS)
 
 
 BUILDERS = {"groot": groot_case, "openpi": openpi_case, "act": act_case, "smolvla": smolvla_case, "pi0": pi_case, "pi05": pi_case, "gr00t_n1_5": n1_5_case, "gr00t_n1_6": n1_6_case,
