@@ -57,6 +57,8 @@ class Pair:
         batch = dict(self.batch)
         if self.case.parent.name == "gr00t_n1_7" and len({pixels.shape for pixels in frames.values()}) > 1:
             return self.stacked_late(frames)
+        if self.case.parent.name == "groot" and len({pixels.shape for pixels in frames.values()}) > 1:
+            frames = {view: self.squeezed(pixels) for view, pixels in frames.items()}
         for view, pixels in frames.items():
             batch[f"observation.images.{view}"] = torch.from_numpy(pixels).permute(2, 0, 1).float().div(255)
         try:
@@ -79,6 +81,15 @@ class Pair:
         except vla_cpp.BadObservation:
             return None
 
+
+    def squeezed(self, pixels):
+        """LeRobot stacks the cameras of its own GR00T before it makes squares of them, each by itself: here the squares are stacked."""
+        import torch
+        from torchvision.transforms.v2 import InterpolationMode, functional
+
+        side = {"n1_5": 28, "n1_7": 32}[self.case.name]
+        image = torch.from_numpy(pixels).permute(2, 0, 1)
+        return functional.resize(image, [side, side], interpolation=InterpolationMode.BICUBIC, antialias=True).permute(1, 2, 0).numpy()
 
     def stacked_late(self, frames):
         """LeRobot stacks the cameras of N1.7 before it transforms them, and so takes frames of one size alone; its authors stack them
@@ -116,7 +127,7 @@ def cases(only):
 def wanted(name, only):
     """Without --only all families that run in this environment."""
     family = name.split("/")[0]
-    return family == only if only else family not in ("turbovla_authors", "openvla") and name != "groot/n1_5"
+    return only in (family, name) if only else family not in ("turbovla_authors", "openvla") and name != "groot/n1_5"
 
 
 def check(name, count, seed):
@@ -165,7 +176,7 @@ def main():
         sub = commands.add_parser(command)
         sub.add_argument("--count", type=int, default=count)
         sub.add_argument("--seed", type=int, default=0)
-        sub.add_argument("--only", help="a family, as smolvla")
+        sub.add_argument("--only", help="a family or a case, as smolvla or groot/n1_5")
     args = parser.parse_args()
     from goldens.recorder import open_reference
 

@@ -19,7 +19,8 @@ from camera_sizes import ROOT, Pair, wanted
 
 RECORDED = ROOT / "tests/golden/empty_instructions.json"
 CASES = ("act/two_views", "diffusion/ddim", "evo1/two_views", "evo1/lerobot", "gr00t_n1_5/libero", "gr00t_n1_6/libero", "gr00t_n1_7/libero", "gr00t_n1_7/clean_text",
-         "openvla/bridge", "pi0/two_views", "pi05/two_views", "pi0_fast/two_views", "smolvla/two_views", "turbovla/two_views", "turbovla/no_state", "turbovla_authors/two_views", "vla_jepa/libero",
+         "groot/n1_5", "groot/n1_7", "openvla/bridge", "pi0/two_views", "pi05/two_views", "pi0_fast/two_views", "smolvla/two_views", "turbovla/two_views",
+         "turbovla/no_state", "turbovla_authors/two_views", "vla_jepa/libero",
          "xvla/two_views")
 
 
@@ -55,7 +56,8 @@ def main():
     open_reference()
     warnings.filterwarnings("ignore")
     recorded = json.loads(RECORDED.read_text())
-    lines = (f" {json.dumps(name)}: {json.dumps(answer(name) if wanted(name, only) else recorded[name])}" for name in CASES)
+    lines = (f" {json.dumps(name)}: {json.dumps(answer(name) if wanted(name, only) else recorded[name])}" for name in CASES
+             if wanted(name, only) or name in recorded)
     RECORDED.write_text("{\n" + ",\n".join(lines) + "\n}\n")
 
 

@@ -13,7 +13,7 @@ import json
 import shutil
 import tempfile
 import types
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest import mock
 
@@ -91,12 +91,13 @@ class Saved:
         write_json(folder / "config.json", common | TRAINING | {
             "type": "groot", "input_features": shown, "output_features": actions, "embodiment_tag": "new_embodiment",
             "normalization_mapping": {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}} | self.own() | self.config, indent=2)
-        self.write_pipelines(folder, statistics(self.d_state, self.d_action, seed, self.zero_spread))
+        self.write_pipelines(folder, seed)
         return n
 
-    def write_pipelines(self, folder, numbers):
+    def write_pipelines(self, folder, seed):
+        numbers = statistics(self.d_state, self.d_action, seed, self.zero_spread)
         numbers = {f"{feature}.{name}": np.asarray(x, "<f4") for feature, table in numbers.items() for name, x in sorted(table.items())}
-        for kind, steps in zip(("pre", "post"), self.steps()):
+        for kind, steps in zip(("pre", "post"), self.steps(seed)):
             name, out = f"policy_{kind}processor", []
             for i, (step, config) in enumerate(steps):
                 out.append({"registry_name": step, "config": config})
@@ -148,7 +149,7 @@ class Saved15(Saved):
         return {"chunk_size": 50, "n_action_steps": 50, "max_state_dim": self.base.head["max_state_dim"], "image_size": [224, 224],
                 "max_action_dim": self.base.head["max_action_dim"], "base_model_path": "nvidia/GR00T-N1.5-3B", "tokenizer_assets_repo": REPO}
 
-    def steps(self):
+    def steps(self, seed):
         pack = {"state_horizon": 1, "action_horizon": 16, "max_state_dim": self.base.head["max_state_dim"],
                 "max_action_dim": self.base.head["max_action_dim"], "language_key": "task", "formalize_language": False,
                 "embodiment_tag": "new_embodiment", "embodiment_mapping": MAPPING_N1_5, "normalize_min_max": True} | self.pack
@@ -184,7 +185,7 @@ class Saved17(Saved):
                 "tune_vlln": True, "tune_top_llm_layers": 0, "num_inference_timesteps": None, "rtc_ramp_rate": None, "use_flash_attention": False,
                 "model_params_fp32": True, "image_size": [256, 256], "tokenizer_assets_repo": None, "pretrained_revision": None}
 
-    def steps(self):
+    def steps(self, seed):
         pack = {"state_horizon": 1, "action_horizon": 40, "valid_action_horizon": 40, "video_horizon": None,
                 "max_state_dim": self.base.head["max_state_dim"], "max_action_dim": self.base.head["max_action_dim"], "language_key": "task",
                 "formalize_language": True, "embodiment_tag": "new_embodiment", "embodiment_mapping": {"libero_sim": 0, "new_embodiment": 1},
@@ -197,6 +198,27 @@ class Saved17(Saved):
                   "libero_gripper_binarize": True} | self.unpack
         return ([layout.rename({}), layout.BATCH, ("groot_n1_7_pack_inputs_v1", pack), ("groot_n1_7_vlm_encode_v1", encode), layout.device()],
                 [("groot_action_unpack_unnormalize_v2", unpack), layout.device()])
+
+
+@dataclass(frozen=True)
+class SavedKeys(Saved17):
+    """By GR00T's statistics, key by key."""
+
+    @property
+    def states(self):
+        return self.base.robot.states
+
+    def steps(self, seed):
+        (before, after), robot = super().steps(seed), self.base.robot
+        own = {"raw_stats": self.base.statistics(seed)[self.base.tag], "modality_config": gr00t.modalities(robot)}
+        dict(before)["groot_n1_7_pack_inputs_v1"].update(own | {"video_modality_keys": list(robot.views), "video_horizon": 1})
+        decode = own | {"env_action_dim": self.d_action, "use_percentiles": False, "use_relative_action": bool(robot.relative), "action_decode_transform": None}
+        return before, [("groot_n1_7_action_decode_v1", decode), *after[1:]]
+
+
+def n1_7_keys(sizes, robot, *parts, **more):
+    plain = n1_7(sizes, sum(robot.states.values()), sum(robot.actions.values()), *parts, **more)
+    return SavedKeys(**vars(plain) | {"base": replace(plain.base, robot=robot)})
 
 
 def n1_7(sizes, d_state, d_action, vision, text, head, side, **more):
@@ -246,7 +268,17 @@ def draw_n1_7(r, sizes, d_state, d_action, tower, text_sizes, head, more):
     return n1_7({view: (size, size) for view in sizes} if albumentations else sizes, d_state, d_action, vision, text, head, side, **more)
 
 
-DRAWN = {"n1_5": draw_n1_5, "n1_7": draw_n1_7}  # release -> what a random configuration has of its own
+def draw_n1_7_keys(r, sizes, d_state, d_action, tower, text_sizes, head, more):
+    """The same by GR00T's statistics: a gripper at either end, an arm that may be relative, of which the state has as many numbers."""
+    drawn = draw_n1_7(r, sizes, d_state, d_action, tower, text_sizes, head | {"max_state_dim": 20, "max_action_dim": 20}, more)
+    keys = {"arm": d_action, "gripper": 1} if r.random() < 0.5 else {"gripper": 1, "arm": d_action}
+    more = {name: value for name, value in vars(drawn).items() if name in ("config", "stored_head", "encode")}
+    more["pack"] = {"clip_outliers": drawn.pack["clip_outliers"], "formalize_language": drawn.pack["formalize_language"]}
+    robot = Robot(tuple(sizes), {"rest": 2} | keys, keys, r.randint(1, head["action_horizon"]), {"arm": None} if r.random() < 0.5 else {})
+    return n1_7_keys(drawn.sizes, robot, drawn.base.vision, drawn.base.text, drawn.base.head, drawn.base.side, **more)
+
+
+DRAWN = {"n1_5": draw_n1_5, "n1_7": draw_n1_7, "n1_7_keys": draw_n1_7_keys}  # release -> what a random configuration has of its own
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------
@@ -318,7 +350,8 @@ def load_n1_7(checkpoint, dtype):
         before, after = make_pre_post_processors(config, str(checkpoint))
         for step in before.steps:
             getattr(step, "proc", None)  # built on first use
-    return Reference17(policy), before, after
+    robot = getattr(after.steps[0], "modality_config", None)
+    return Reference17(policy, len(robot["action"]["delta_indices"]) if robot else None), before, after
 
 
 def load_n1_5(checkpoint, dtype):
@@ -355,7 +388,14 @@ class Reference15:
 
 
 class Reference17(Reference15):
-    """The same of N1.7."""
+    """The same of N1.7, with the rows that its last step keeps."""
+
+    def __init__(self, policy, n_row):
+        super().__init__(policy)
+        self.n_row = n_row
+
+    def predict_action_chunk(self, batch, noise):
+        return super().predict_action_chunk(batch, noise)[:, : self.n_row]
 
 
 def Recorder(reference):
