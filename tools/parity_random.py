@@ -288,7 +288,7 @@ def draw_openvla(seed):
     d_action = r.randint(1, 9)
     unmasked = r.choice((None, (), (d_action - 1,), tuple(i for i in range(d_action) if r.random() < 0.4)))
     others = r.choice(((), ("fractal20220817_data", "taco_play")))
-    checkpoint = openvla.Checkpoint(*towers, text, 14 * r.choice((1, 2, 2, 3)), d_action, r.choice((256, 256, 2, 17, 100)), r.choice((1, 1, 3)),
+    checkpoint = openvla.Checkpoint(*towers, text, 14 * r.choice((1, 2, 2, 3)), d_action, r.choice((256, 256, 17, 100)), r.choice((1, 1, 3)),
                                     r.random() < 0.3, others, unmasked)
     frame = r.randint(10, 90), r.randint(10, 90), r.choice(("png", "png", "jpg"))
     return openvla.case(seed, frame, r.choice((*TEXTS, "", "Pick UP the <s> cube</s> \u2581", "<PAD>")), checkpoint, **({"stats": "bridge_orig"} if others else {}))

@@ -20,7 +20,6 @@ from vla_cpp.convert.errors import Code, Problems
 
 SEED = 4
 SMALL = openvla.Checkpoint(Tower(16, 2, 20), Tower(32, 3, 28), decoder(16, 2, 2, 1, 24))
-PUBLISHED = openvla.Checkpoint(Tower(1024, 24, 4096), Tower(1152, 27, 4304), {}, side=224)
 PIXELS = [{"mean": tuple(mean), "std": tuple(std)} for mean, std in zip(MEANS, STDS)]
 
 
@@ -56,9 +55,8 @@ def sizes_of(checkpoint, **config):
 @pytest.fixture(scope="module")
 def published():
     """With the text_config of openvla-7b, which leaves all sizes to LlamaConfig."""
-    llama = decoder(4096, 32, 32, 32, 11008)
     text = {"model_type": "llama", "pad_token_id": 32000, "torch_dtype": "bfloat16", "vocab_size": 32064}
-    return sizes_of(replace(PUBLISHED, text=llama), text_config=text)
+    return sizes_of(openvla.published(), text_config=text)
 
 
 def test_every_tensor_of_the_reference_is_read_or_dropped():

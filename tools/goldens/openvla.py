@@ -16,7 +16,7 @@ import json
 import os
 import sys
 import types
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +76,7 @@ class Checkpoint:
     own_statistics: bool = False  # dataset_statistics.json, as fine-tuning writes it
     other_stats: tuple = ()  # data sets beside the robot's own
     unmasked: tuple = (6,)  # columns that are not normalized; None: the statistics have no mask
-    more_text: dict = field(default_factory=dict)
+    n_token: int = N_TOKEN  # of the language model, without its padding
     zero_spread = ()
     d_state = 0
 
@@ -86,7 +86,7 @@ class Checkpoint:
 
     @property
     def n_vocab(self):
-        return N_TOKEN + PAD_TO
+        return self.n_token + PAD_TO
 
     def shapes(self):
         t, d = self.text, self.text["hidden_size"]
@@ -105,7 +105,7 @@ class Checkpoint:
         x = parameter(known, shape[1:] if shape[0] == 1 and len(shape) > 1 else shape, seed).reshape(shape)
         if name == "language_model.lm_head.weight":
             others = np.ones(self.n_vocab, bool)
-            others[N_TOKEN - self.n_bin + 1 : N_TOKEN] = False
+            others[self.n_token - self.n_bin + 1 : self.n_token] = False
             x[others] /= f32(64)
         return x
 
@@ -140,7 +140,7 @@ class Checkpoint:
             "hf_llm_id": "meta-llama/Llama-2-7b-hf", "image_resize_strategy": "resize-naive", "image_sizes": [self.side] * 2,
             "llm_backbone_id": "llama2-7b-pure", "llm_max_length": 2048, "model_type": "openvla", "n_action_bins": self.n_bin,
             "norm_stats": {"elsewhere": {"action": {}}} if self.own_statistics else self.statistics(seed), "output_projector_states": False,
-            "pad_to_multiple_of": PAD_TO, "pad_token_id": N_TOKEN, "text_config": text | self.text | self.more_text, "timm_model_ids": TIMM,
+            "pad_to_multiple_of": PAD_TO, "pad_token_id": N_TOKEN, "text_config": text | self.text, "timm_model_ids": TIMM,
             "timm_override_act_layers": [None, None], "torch_dtype": "bfloat16", "transformers_version": "4.40.1",
             "use_fused_vision_backbone": True, "vision_backbone_id": "dinosiglip-vit-so-224px"}
 
@@ -163,6 +163,14 @@ class Checkpoint:
             return {"action": action | mask, "num_trajectories": 10, "num_transitions": 1000, "proprio": {"mean": [0.0] * 7}}
 
         return {name: entry(seed + i) for i, name in enumerate(("bridge_orig", *self.other_stats))}
+
+
+FRAMES = {"image": (256, 256, "png")}  # of the published size
+
+
+def published(views=("image",), arch="openvla"):
+    """The size of openvla-7b: 7.5 G parameters, with fewer tokens than the 29,872 from which the reference's empty token is one of them."""
+    return Checkpoint(Tower(1024, 24, 4096), Tower(1152, 27, 4304), decoder(4096, 32, 32, 32, 11008), 224, n_token=29760)
 
 
 def case(seed, frame, text, checkpoint, **options):
