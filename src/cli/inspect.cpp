@@ -176,7 +176,10 @@ void print_human(const Engine& engine) {
   if (const auto chosen = robot.bundle().keys().string("vla.quantization")) say(stdout, "quantized    {}\n", *chosen);
   say(stdout, "checksum     {}\n", d.checksum);
   print_features(d, robot);
-  say(stdout, "solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);
+  if (const Solver& solver = robot.solver(); solver.decodes)
+    say(stdout, "answer       at most {} tokens, each the likeliest, up to token {}\n", d.n_step, solver.stop_token);
+  else
+    say(stdout, "solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);
   say(stdout, "leftover     {}\n",
       d.real_time_chunking.empty() ? "refused: no real-time chunking" : d.real_time_chunking);
   if (d.rtc.execution_horizon > 0)
