@@ -35,7 +35,7 @@ WIDE = {
                           "head": gr00t.head(4, (6, 3, 64), (2, 3, 64), D, 14, 11, 8)},
     "groot/n1_5": {"base": replace(all_cases()["groot/n1_5"].checkpoint.base, vision=gr00t_n1_5.vision(D, 3, 3, FF, 28),
                                    text=gr00t_n1_5.text(D, 5, 3, 1, 64, FF), head=gr00t.head(3, (6, 3, 64), (2, 3, 64), D, 14, 11, 6))},
-    "openvla/bridge": {"dino": openvla.Tower(D, 3, FF), "siglip": openvla.Tower(D, 4, FF), "text": openvla.decoder(D, 3, 3, 1, FF)},
+    "openvla/bridge": {"dino": openvla.Tower(D, 2, FF), "siglip": openvla.Tower(D, 2, FF), "text": openvla.decoder(D, 2, 3, 1, FF)},
     "pi0/two_views": PI,
     "pi05/two_views": PI,
     "smolvla/two_views": {"vision": smolvla.vision(D, 2, 3, FF, 32, 8), "text": smolvla.text(D, 4, 3, 1, 64, FF)},
