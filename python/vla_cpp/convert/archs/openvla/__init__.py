@@ -37,10 +37,7 @@ STATISTICS, IMAGES, TOKENIZER, GENERATION = (
 )
 VIEW, ALIAS = "image", "full_image"
 QUESTION, ANSWER = "In: What action should the robot take to ", "?\nOut:"
-EMPTY, EMPTY_ID = (
-    "\u2581",
-    29871,
-)  # behind every prompt: their "empty token", a blank that no word follows, by its id in Llama 2's vocabulary
+EMPTY, EMPTY_ID = "\u2581", 29871  # behind every prompt: a blank that no word follows, with its id in Llama 2's vocabulary
 MAX_TOKENS = 256  # of a prompt, far above any instruction: the reference cuts none
 # What their functions of images are made from, where a file states the results as well.
 DERIVED = {"tvf_resize_params", "tvf_crop_params", "tvf_normalize_params", "tvf_do_letterbox", "tvf_letterbox_fill"}
