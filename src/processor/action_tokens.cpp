@@ -9,12 +9,13 @@ namespace vla {
 Result<std::optional<ActionTokens>> ActionTokens::read(const Keys& keys) {
   constexpr const char* kKind = "action_tokens.kind";
   if (!keys.has(kKind)) return std::optional<ActionTokens>();
-  VLA_TRY(const std::string kind, keys.string(kKind));
-  if (kind == "fast") {
+  const Result<std::string> kind = keys.string(kKind);
+  if (!kind) return kind.error();
+  if (*kind == "fast") {
     VLA_TRY(FastTokens tokens, FastTokens::read(keys));
     return std::optional(ActionTokens(std::move(tokens)));
   }
-  if (kind != "bins") return misfit(kKind, "fast or bins", kind);
+  if (*kind != "bins") return misfit(kKind, "fast or bins", *kind);
   VLA_TRY(BinTokens tokens, BinTokens::read(keys));
   return std::optional(ActionTokens(tokens));
 }
