@@ -17,12 +17,12 @@ from ..checkpoint import Checkpoint
 from ..errors import Code, Problems, refuse
 from ..features import robot_keys
 from ..hub import ACTION_TOKENIZER_PATTERNS, HUB_FORM, hub_folder
-from ..layers import linear
+from ..layers import Rows, linear
 from ..lerobot import action_width, check_keys, check_widths, given_tokenizer, no_position_rule, read_views, state_width, view_keys
 from ..networks import keys_of, pick
 from ..section import Section
 from ..tokenizer import TokenizerPlan, read_tokenizer
-from . import Dropped, Options, Plan
+from . import Options, Plan
 from .pi0 import TOKENIZER
 from .pi0.layouts import BINS, CLEAN
 from .pi0.mapping import EMBEDDING, LM, LM_HEAD, VISION, Sizes, canonical, check_image, paligemma, read_paligemma, rename, rounded
@@ -100,7 +100,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         ],
     }
     keys = [
-        *_network_keys(sizes),
+        *network_keys(sizes),
         *robot_keys(view_keys(checkpoint, views, processors, problems), dims, options.dataset_info, checkpoint.notes, problems),
         Key("observation.max_text_tokens", "u32", max_tokens),
         *text.keys,
@@ -108,10 +108,13 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         recipe.recipe_key(document),
     ]
     problems.raise_any()
+    rows = [row._replace(keep_f32=not rounded(row)) for row in weights(sizes, checkpoint)]
+    return Plan(keys, rows, [], processors.statistics(), _hints(sizes))
+
+
+def weights(s: Sizes, checkpoint: Checkpoint) -> Rows:
     head = LM_HEAD if LM_HEAD in checkpoint.tensors or EMBEDDING not in checkpoint.tensors else EMBEDDING
-    rows = [*paligemma(sizes, checkpoint, "norm"), *linear("lm.head", head[: -len(".weight")], sizes.lm.n_vocab, sizes.lm.d_model, bias=False)]
-    dropped: List[Dropped] = []
-    return Plan(keys, [row._replace(keep_f32=row.keep_f32 or not rounded(row)) for row in rows], dropped, processors.statistics(), _hints(sizes))
+    return [*paligemma(s, checkpoint, "norm"), *linear("lm.head", head[: -len(".weight")], s.lm.n_vocab, s.lm.d_model, bias=False)]
 
 
 def _sizes(policy: Section, checkpoint: Checkpoint, options: Options, problems: Problems):
@@ -167,7 +170,7 @@ def _action_tokenizer(checkpoint: Checkpoint, options: Options) -> str:
     raise refuse(where, "--action-tokenizer DIR, or {}/ inside the checkpoint".format(FOLDER), "neither", hint, Code.IO)
 
 
-def _network_keys(s: Sizes) -> List[Key]:
+def network_keys(s: Sizes) -> List[Key]:
     return keys_of(
         {
             "policy": dict(pick(s, "d_state d_action horizon"), text_scale=s.lm.d_model**0.5),
