@@ -126,6 +126,11 @@ def test_a_robot_that_no_mapping_names_is_the_first_one(saved):
     assert np.array_equal(saved.convert().tensors["state_in.weight"], first)
 
 
+def without_gripper(saved):
+    saved.config["action_decode_transform"] = "libero"
+    saved.pack["modality_config"]["action"]["modality_keys"] = ["x", "hand"]
+
+
 def renamed(saved):
     saved.before["rename_observations_processor"]["rename_map"] = {"observation.images.a": "observation.images.front"}
 
@@ -136,7 +141,11 @@ def renamed(saved):
         (renamed, "rename_map: expected {}"),
         (lambda s: s.config.update(lora_rank=8), "lora_rank: expected 0"),
         (lambda s: s.config.update(strange=1), "strange"),
-        (lambda s: (s.config.update(action_decode_transform="libero"), s.decode.update(env_action_dim=1)), "an action key gripper of one number"),
+        (without_gripper, "an action key gripper of one number"),
+        (lambda s: s.decode.update(env_action_dim=1), "env_action_dim: expected 0, or at least the 2 numbers of the keys"),
+        (lambda s: s.decode.pop("raw_stats"), "raw_stats: expected the same as of groot_n1_7_pack_inputs_v1"),
+        (lambda s: s.decode.update(modality_config=None), "modality_config: expected the same as of groot_n1_7_pack_inputs_v1"),
+        (lambda s: s.pack.update(video_horizon=2), "video_horizon: expected 1, the moments of modality_config"),
         (lambda s: s.decode.update(use_percentiles=False), "use_percentiles: expected the same as of groot_n1_7_pack_inputs_v1"),
         (lambda s: s.pack.update(raw_stats=None), "raw_stats: expected a value"),
         (lambda s: s.pack.update(normalize_min_max=False), "normalize_min_max: expected True"),

@@ -92,34 +92,37 @@ def _keys(checkpoint: Checkpoint, steps: Dict[str, Step], pack: Section, setting
     for name in PACK_READ:
         if pack.get(name) is None:
             pack.bad(name, "a value", hint="the policy was saved without GR00T's own statistics", unsupported=True)
-    for name in ("modality_config", "use_percentiles", "raw_stats"):
-        if name in decode.values and decode.get(name) is not None and decode.get(name) != pack.get(name):
+    for name in ("modality_config", "use_percentiles", "raw_stats"):  # without which LeRobot leaves actions as they are
+        if decode.get(name) != pack.get(name):
             decode.bad(name, "the same as of " + PACK, "another")
     robot = dict(member(pack.values, "modality_config", dict, pack.where))
     video = robot.get("video")
     if isinstance(video, dict) and video.get("modality_keys") != pack.get("video_modality_keys"):
         pack.bad("video_modality_keys", "those of modality_config")
+    moments = video.get("delta_indices") if isinstance(video, dict) else None
+    if isinstance(moments, list) and pack.get("video_horizon") not in (None, len(moments)):
+        pack.bad("video_horizon", "{}, the moments of modality_config".format(len(moments)), hint="LeRobot repeats frames", unsupported=True)
     action = member(robot, "action", dict, pack.where)
     delta = action.get("delta_indices")
     if isinstance(delta, list):
         robot["action"] = {**action, "delta_indices": delta[: min([len(delta), *_limits(checkpoint.config)])]}
     settings["use_relative_action"] = decode.get("use_relative_action")
+    widths = _widths(action, pack)
+    if 0 < decode.count("env_action_dim", minimum=0) < sum(widths.values()):
+        decode.bad("env_action_dim", "0, or at least the {} numbers of the keys".format(sum(widths.values())), unsupported=True)
     if _transform(checkpoint.config, options, problems):
-        _add_gripper(checkpoint, _gripper(action, pack, decode, problems))
+        if widths.get("gripper") != 1:
+            problems.unsupported(CONFIG + ": action_decode_transform", "none, or an action key gripper of one number", "libero")
+        _add_gripper(checkpoint, sum(list(widths.values())[: [*widths, "gripper"].index("gripper")]))
     return robot, pack.get("raw_stats")
 
 
-def _gripper(action: dict, pack: Section, decode: Section, problems: Problems) -> int:
-    """The column of the key "gripper", which must have one number."""
-    start, statistics = 0, member(member(pack.values, "raw_stats", dict, pack.where), "action", dict, pack.where)
-    for key in member(action, "modality_keys", list, pack.where):
-        stated = statistics.get(key)
-        width = len(stated.get("min") or ()) if isinstance(stated, dict) else 0
-        if key == "gripper" and width == 1 and not 0 < decode.count("env_action_dim", minimum=0) <= start:
-            return start
-        start += width
-    problems.unsupported(CONFIG + ": action_decode_transform", "none, or an action key gripper of one number", "libero")
-    return 0
+def _widths(action: dict, pack: Section) -> Dict[str, int]:
+    """Numbers of an action by its keys. What is amiss with the statistics is told where they are read."""
+    statistics = member(member(pack.values, "raw_stats", dict, pack.where), "action", dict, pack.where)
+    stated = {str(key): statistics.get(key) for key in member(action, "modality_keys", list, pack.where)}
+    lists = {key: values.get("min") if isinstance(values, dict) else None for key, values in stated.items()}
+    return {key: len(values) if isinstance(values, list) else 0 for key, values in lists.items()}
 
 
 def _vectors(checkpoint: Checkpoint, steps: Dict[str, Step], pack: Section, settings: Dict[str, Any], options: Options, problems: Problems) -> tuple:
