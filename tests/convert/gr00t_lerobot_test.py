@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from goldens.files import write_safetensors
 from tiny import save_shards, write_json
 from tiny_gr00t import HORIZON, TAG, TinyGr00t
 from vla_cpp.convert import Code, Options, convert_checkpoint, read_bundle
@@ -39,6 +40,9 @@ class Saved:
             "env_action_dim": 3, "raw_stats": tiny.statistics[TAG], "modality_config": robot, "use_percentiles": kwargs["use_percentiles"],
             "use_relative_action": kwargs["use_relative_action"], "action_decode_transform": None,
         }  # fmt: skip
+        names = ("q01", "q99") if kwargs["use_percentiles"] else ("min", "max")
+        of_keys = [tiny.statistics[TAG]["state"][key] for key in robot["state"]["modality_keys"]]
+        self.states = {f"observation.state.{part}": np.concatenate([one[name] for one in of_keys]).astype("<f4") for part, name in zip(("min", "max"), names)}
         self.before = {"rename_observations_processor": {"rename_map": {}}, "to_batch_processor": {}, "groot_n1_7_pack_inputs_v1": self.pack}
         self.before |= {"groot_n1_7_vlm_encode_v1": self.encode, "device_processor": {"device": "cpu"}}
         self.after = {"groot_n1_7_action_decode_v1": self.decode, "device_processor": {"device": "cpu"}}
@@ -48,6 +52,9 @@ class Saved:
         write_json(self.own / "config.json", self.config)
         for name, steps in (("pre", self.before), ("post", self.after)):
             steps = [{"registry_name": step, "config": settings} for step, settings in steps.items()]
+            if name == "pre" and len(steps) > 2 and self.states:
+                steps[2]["state_file"] = "state.safetensors"
+                write_safetensors(self.own / "state.safetensors", self.states)
             write_json(self.own / f"policy_{name}processor.json", {"name": "x", "steps": steps})
         save_shards(str(self.own), self.tensors, 1)
         options = {"base": str(self.base), **options}
@@ -145,6 +152,8 @@ def renamed(saved):
         (lambda s: s.decode.update(env_action_dim=1), "env_action_dim: expected 0, or at least the 2 numbers of the keys"),
         (lambda s: s.decode.pop("raw_stats"), "raw_stats: expected the same as of groot_n1_7_pack_inputs_v1"),
         (lambda s: s.decode.update(modality_config=None), "modality_config: expected the same as of groot_n1_7_pack_inputs_v1"),
+        (lambda s: s.states.clear(), "expected a file with them beside the JSON"),
+        (lambda s: s.states.update({"observation.state.max": s.states["observation.state.max"] + 1}), "raw_stats: expected the numbers of the step's file"),
         (lambda s: s.pack.update(video_horizon=2), "video_horizon: expected 1, the moments of modality_config"),
         (lambda s: s.decode.update(use_percentiles=False), "use_percentiles: expected the same as of groot_n1_7_pack_inputs_v1"),
         (lambda s: s.pack.update(raw_stats=None), "raw_stats: expected a value"),

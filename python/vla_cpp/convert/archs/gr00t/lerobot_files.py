@@ -135,7 +135,7 @@ def action_width(config: dict, step: Section) -> int:
 
 def state_group(checkpoint: Checkpoint, config: dict, step: Step, clips: bool, problems: Problems) -> Group:
     """Of the statistics' width, whatever the feature says: LeRobot does not look at it."""
-    low, high = _statistics(checkpoint, step, recipe.STATE, problems)
+    low, high = statistics(checkpoint, step, recipe.STATE, problems)
     stated = member(config, "input_features", dict, CONFIG).get(recipe.STATE)
     shape = stated.get("shape") if isinstance(stated, dict) else None
     if isinstance(stated, dict) and shape != [low.size]:
@@ -145,13 +145,13 @@ def state_group(checkpoint: Checkpoint, config: dict, step: Step, clips: bool, p
 
 
 def action_group(checkpoint: Checkpoint, step: Step, width: int, clips: bool, problems: Problems) -> Group:
-    low, high = _statistics(checkpoint, step, recipe.ACTION, problems)
+    low, high = statistics(checkpoint, step, recipe.ACTION, problems)
     if low.size < width:
         problems.add("{}: {}".format(step.where, recipe.ACTION), "statistics of {} numbers, as config.json has".format(width), str(low.size))
     return Group("action", width, KIND, np.resize(low, width), np.resize(high, width), clips)
 
 
-def _statistics(checkpoint: Checkpoint, step: Step, feature: str, problems: Problems) -> Tuple[np.ndarray, np.ndarray]:
+def statistics(checkpoint: Checkpoint, step: Step, feature: str, problems: Problems) -> Tuple[np.ndarray, np.ndarray]:
     """Least and largest numbers. Without them LeRobot passes what it gets: such a policy was saved before it saw a data set."""
     where, found = "{}: statistics of {}".format(step.where, feature), []
     if not plain_name(step.state_file):

@@ -14,10 +14,13 @@ import os
 import re
 from typing import Any, Dict, List
 
+import numpy as np
+
 from ...checkpoint import Checkpoint
 from ...errors import Problems
 from ...files import member, read_json
 from ...hub import HUB_NAME
+from ...recipe import STATE
 from ...section import Fixed, Section
 from .. import Options
 from . import lerobot_files as files
@@ -107,6 +110,7 @@ def _keys(checkpoint: Checkpoint, steps: Dict[str, Step], pack: Section, setting
     if isinstance(delta, list):
         robot["action"] = {**action, "delta_indices": delta[: min([len(delta), *_limits(checkpoint.config)])]}
     settings["use_relative_action"] = decode.get("use_relative_action")
+    _check_state(checkpoint, steps[PACK], robot, pack, problems)
     widths = _widths(action, pack)
     if 0 < decode.count("env_action_dim", minimum=0) < sum(widths.values()):
         decode.bad("env_action_dim", "0, or at least the {} numbers of the keys".format(sum(widths.values())), unsupported=True)
@@ -115,6 +119,18 @@ def _keys(checkpoint: Checkpoint, steps: Dict[str, Step], pack: Section, setting
             problems.unsupported(CONFIG + ": action_decode_transform", "none, or an action key gripper of one number", "libero")
         _add_gripper(checkpoint, sum(list(widths.values())[: [*widths, "gripper"].index("gripper")]))
     return robot, pack.get("raw_stats")
+
+
+def _check_state(checkpoint: Checkpoint, step: Step, robot: dict, pack: Section, problems: Problems) -> None:
+    """LeRobot normalizes states by the numbers of the step's file, the bundle by those of the keys."""
+    stated = member(member(pack.values, "raw_stats", dict, pack.where), "state", dict, pack.where)
+    found = files.statistics(checkpoint, step, STATE, problems)
+    for name, numbers in zip(("q01", "q99") if pack.get("use_percentiles") else ("min", "max"), found):
+        keys = [stated.get(key) for key in member(member(robot, "state", dict, pack.where), "modality_keys", list, pack.where)]
+        lists = [values.get(name) if isinstance(values, dict) else None for values in keys]
+        wanted = [x for values in lists if isinstance(values, list) for x in values if type(x) in (int, float)]
+        if not np.array_equal(np.asarray(wanted, np.float64).astype(np.float32), numbers):
+            pack.bad("raw_stats", "the numbers of the step's file", "another {} of the state".format(name))
 
 
 def _widths(action: dict, pack: Section) -> Dict[str, int]:
