@@ -139,16 +139,14 @@ void Plan::set_inputs(std::span<const float> pixels, const Device::Sent* ahead, 
 
 void Plan::set_noise(std::span<const float> noise) {
   constexpr std::int32_t kFirst = 0;
+  if (x_ != nullptr) device_.set(*x_, noise.data(), x_->size());
   device_.set(*k_, &kFirst, sizeof(kFirst));
+  if (noise_ != nullptr) device_.set(*noise_, noise.data(), noise.size_bytes());
   decoded_.clear();
   for (const Slot* slot : cache_.appended()) {
     const std::vector<float> zeros(static_cast<std::size_t>(count(slot->shape)));
     device_.set(*slot, zeros.data(), slot->size());
   }
-  if (x_ == nullptr) return;
-  const std::span<const float> start = noise.first(static_cast<std::size_t>(count(x_->shape)));
-  device_.set(*x_, start.data(), start.size_bytes());
-  if (noise_ != nullptr) device_.set(*noise_, noise.data(), noise.size_bytes());
 }
 
 void Plan::set_steering(const Steering& steering) {

@@ -38,6 +38,7 @@ WIDE = {
     "openvla/bridge": {"dino": openvla.Tower(D, 2, FF), "siglip": openvla.Tower(D, 2, FF), "text": openvla.decoder(D, 2, 3, 1, FF)},
     "pi0/two_views": PI,
     "pi05/two_views": PI,
+    "pi0_fast/two_views": {"vision": pi.tower(D, 2, 3, FF), "lm": GEMMA, "rows": {}},
     "smolvla/two_views": {"vision": smolvla.vision(D, 2, 3, FF, 32, 8), "text": smolvla.text(D, 4, 3, 1, 64, FF)},
     "turbovla/two_views": {"vision": turbovla.vision(D, 3, 3, FF, 8, 4), "text": turbovla.text(D, 2, 3, FF), "policy": turbovla.policy(6, D, 3, FF, (2, 2), 24)},
     "turbovla_authors/two_views": {

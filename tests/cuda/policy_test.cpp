@@ -116,6 +116,7 @@ TEST_CASE_FIXTURE(Driver,
     reset_without_computing();
     const GoldenCase golden = GoldenCase::read(path);
     const auto engine = load_engine(golden.bundle(), "", "float32");
+    if (engine->robot().solver().decodes) continue;  // reads each token back
     for (int i = 0; i < 3; ++i) {
       const Counts before = fake_driver().n_call;
       const auto chunk = engine->act(golden.observation, golden.noise);

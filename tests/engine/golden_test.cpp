@@ -179,7 +179,8 @@ TEST_CASE("a second request, and one after a request of another shape, give the 
     REQUIRE(first.ok());
     Observation shorter = golden.observation;
     shorter.text = "go";
-    REQUIRE(engine->act(shorter, golden.noise).ok());
+    const auto other = engine->act(shorter, golden.noise);
+    if (!other) CHECK(other.error().code == Code::bad_action);  // tokens that must begin in one way
     CHECK(engine->act(golden.observation, golden.noise)->actions == first->actions);
   }
 }

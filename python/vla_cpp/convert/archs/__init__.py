@@ -175,7 +175,7 @@ def arch_of(checkpoint: Checkpoint, variant: str) -> str:
     was trained with, or a file that states it. Errors: usage, unsupported."""
     config, layout = checkpoint.config, checkpoint.layout
     if layout == LEROBOT and "type" not in config and "model_type" in config:
-        known = [name for each in authors().values() for name in each.model_types]
+        known = dict.fromkeys(name for each in authors().values() for name in each.model_types)
         raise refuse("config.json: model_type", "one of " + ", ".join(known), str(config["model_type"]), "", Code.UNSUPPORTED)
     if layout != OPENPI:
         return config.get("type") if layout == LEROBOT else layout
