@@ -113,9 +113,13 @@ void Plan::record_solver(Graph& step, const Network& network, LowerOptions& chan
 /// Prefix and step leave their logits in the same slot, and the step's own keys and values stay where it finds them.
 void Plan::record_decoder(Graph& step, const Network& network, LowerOptions& changing) {
   logits_ = cache_.slot("logits");
+  read_logits_.resize(static_cast<std::size_t>(count(logits_->shape)));
+  decoded_.reserve(static_cast<std::size_t>(solver_.n_step));
   const Tensor logits =
       network.policy.decode(step, step.input(token_), step.input(k_), std::max(1, solver_.n_run()), cache_);
   step.write(step.name("logits", logits), logits_);
+  for (const Slot* slot : cache_.appended())
+    no_token_.resize(std::max(no_token_.size(), static_cast<std::size_t>(count(slot->shape))));
   changing.varying.push_back(token_);
   changing.varying.insert(changing.varying.end(), cache_.appended().begin(), cache_.appended().end());
 }
@@ -143,10 +147,7 @@ void Plan::set_noise(std::span<const float> noise) {
   device_.set(*k_, &kFirst, sizeof(kFirst));
   if (noise_ != nullptr) device_.set(*noise_, noise.data(), noise.size_bytes());
   decoded_.clear();
-  for (const Slot* slot : cache_.appended()) {
-    const std::vector<float> zeros(static_cast<std::size_t>(count(slot->shape)));
-    device_.set(*slot, zeros.data(), slot->size());
-  }
+  for (const Slot* slot : cache_.appended()) device_.set(*slot, no_token_.data(), slot->size());
 }
 
 void Plan::set_steering(const Steering& steering) {
@@ -167,11 +168,11 @@ Status Plan::run_prefix(std::vector<Tap>& taps) {
 
 Result<bool> Plan::needs_step(int k) {
   if (token_ == nullptr) return k < solver_.n_step;
-  const std::vector<float> logits = device_.get(*logits_);
+  device_.get(*logits_, read_logits_.data(), logits_->size());
   VLA_CHECK(device_.failure());
-  if (!std::ranges::all_of(logits, [](float x) { return std::isfinite(x); }))
+  if (!std::ranges::all_of(read_logits_, [](float x) { return std::isfinite(x); }))
     return Error{Code::bad_action, fmt::format("token {}", k), "finite logits", "one that is not"};
-  const auto likeliest = static_cast<std::int32_t>(std::ranges::max_element(logits) - logits.begin());
+  const auto likeliest = static_cast<std::int32_t>(std::ranges::max_element(read_logits_) - read_logits_.begin());
   decoded_.push_back(static_cast<float>(likeliest));
   device_.set(*token_, &likeliest, sizeof(likeliest));
   return likeliest != solver_.stop_token && k < solver_.n_run();

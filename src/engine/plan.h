@@ -101,7 +101,8 @@ class Plan {
   Slot *images_, *tokens_, *state_, *x_, *token_, *k_, *noise_, *target_, *keep_, *pull_;
   Slot* logits_ = nullptr;
   const Solver& solver_;
-  std::vector<float> decoded_;  // tokens of this act
+  std::vector<float> decoded_;                 // tokens of this act
+  std::vector<float> read_logits_, no_token_;  // as the host reads them; what a slot of appended values starts from
   std::uint64_t views_;
   TextLayout text_;
   Cache cache_;
