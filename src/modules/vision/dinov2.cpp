@@ -11,7 +11,8 @@
 namespace vla {
 
 DinoV2::DinoV2(const Scope& s)
-    : d_model_(s.dim("d_model")),
+    : path_(s.path()),
+      d_model_(s.dim("d_model")),
       image_size_(s.dim("image_size", 16384)),
       n_side_(std::max(1, image_size_ / s.dim("patch_size", 256))),
       n_register_(s.index("n_register", 1024)),
@@ -27,7 +28,7 @@ DinoV2::DinoV2(const Scope& s)
 
 Status DinoV2::check(int width, int height) const {
   if (width == image_size_ && height == image_size_) return {};
-  return Error{Code::unsupported, "vision.image_size", fmt::format("images of {0} x {0}", image_size_),
+  return Error{Code::unsupported, path_ + ".image_size", fmt::format("images of {0} x {0}", image_size_),
                fmt::format("{} x {}", width, height)};
 }
 

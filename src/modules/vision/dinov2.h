@@ -3,6 +3,7 @@
 #pragma once
 
 #include <optional>
+#include <string>
 #include <vector>
 
 #include "modules/encoder_block.h"
@@ -27,6 +28,7 @@ class DinoV2 {
   int n_patch() const { return n_side_ * n_side_; }
 
  private:
+  std::string path_;
   int d_model_, image_size_, n_side_, n_register_;
   const Param* class_token_;
   PatchEmbed patch_embed_;
