@@ -63,7 +63,8 @@ class DryPolicy {
     };
     add([](InputShape& shape) { shape.n_text = std::max(std::min(1, shape.n_text), shape.n_text - 47); });
     add([](InputShape& shape) { shape.n_view = 1, shape.views &= 1; });
-    add([](InputShape& shape) { shape.steered = true; });
+    if (robot_->real_time_chunking().kind != RealTimeChunking::Kind::none)
+      add([](InputShape& shape) { shape.steered = true; });
     return all;
   }
 
