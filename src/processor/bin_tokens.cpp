@@ -26,8 +26,8 @@ Result<std::vector<float>> BinTokens::decode(std::span<const std::int32_t> ids, 
                                              std::string* note) const {
   const auto n = static_cast<std::size_t>(horizon) * static_cast<std::size_t>(d_action);
   if (ids.size() < n)
-    return Error{Code::bad_action, kActionTokens, fmt::format("{}, one for each number", n), std::to_string(ids.size()),
-                 "the policy stopped before"};
+    return Error{Code::bad_action, "action tokens", fmt::format("{}, one for each number", n),
+                 std::to_string(ids.size()), "the policy stopped before"};
   std::vector<float> chunk;
   for (const std::int32_t id : ids.last(n)) {
     const int bin = first_id_ - id, nearest = std::clamp(bin, 0, n_bin_ - 2);

@@ -12,9 +12,6 @@
 
 namespace vla {
 
-/// Where a refusal says that tokens stand for no chunk.
-inline constexpr const char* kActionTokens = "action tokens";
-
 /// A token for each number of a chunk, which names one of the even bins of [-1, 1]. Source: openvla
 /// prismatic/extern/hf/modeling_prismatic.py (OpenVLAForActionPrediction.predict_action).
 class BinTokens {

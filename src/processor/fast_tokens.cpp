@@ -9,7 +9,6 @@
 #include <cmath>
 #include <numbers>
 
-#include "processor/bin_tokens.h"
 #include "processor/bpe.h"
 #include "processor/recipe.h"
 #include "processor/unicode.h"
@@ -93,10 +92,10 @@ Result<std::vector<float>> FastTokens::decode(std::span<const std::int32_t> ids,
 Status FastTokens::check(std::span<const std::int32_t> ids) const {
   const auto is_unknown = [this](std::int32_t id) { return id < 0 || id >= n_vocab_; };
   if (const auto found = std::find_if(ids.begin(), ids.end(), is_unknown); found != ids.end())
-    return Error{Code::bad_action, kActionTokens, fmt::format("ids below {}", n_vocab_), std::to_string(*found)};
+    return Error{Code::bad_action, "action tokens", fmt::format("ids below {}", n_vocab_), std::to_string(*found)};
   const auto front = ids.first(std::min(ids.size(), required_.size()));
   if (std::equal(front.begin(), front.end(), required_.begin(), required_.end())) return {};
-  return Error{Code::bad_action, kActionTokens, fmt::format("ids {} first", fmt::join(required_, ", ")),
+  return Error{Code::bad_action, "action tokens", fmt::format("ids {} first", fmt::join(required_, ", ")),
                fmt::format("{}", fmt::join(front, ", ")), "the policy did not answer with actions"};
 }
 

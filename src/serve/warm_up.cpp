@@ -68,9 +68,11 @@ Observation largest_observation(const Robot& robot, std::uint64_t number) {
   return observation;
 }
 
-Status act(Engine& engine, const Observation& observation, std::uint64_t seed) {
+/// Acts. A policy that decodes tokens computes the first one only, since grey frames may be answered with a text.
+Status act(Engine& engine, const Robot& robot, const Observation& observation, std::uint64_t seed) {
   EncodedObservation encoded;  // its memory is not kept: every act that is served brings its own
   VLA_CHECK(engine.encode(observation, Noise(seed), {}, encoded));
+  if (robot.solver().decodes) return engine.warm_up({observation.embodiment, robot.shape_of(encoded)});
   VLA_CHECK(engine.send_ahead(encoded));
   const auto chunk = engine.compute(encoded);
   return chunk ? Status() : chunk.error();
@@ -90,10 +92,9 @@ Status warm_up(Engine& engine, const Robot& robot) {
   bool is_finite = true;
   std::uint64_t last = 0;
   for (std::uint64_t number = 0; number < kTries; ++number) {
-    const Status answered = act(engine, largest_observation(robot, number), number);
+    const Status answered = act(engine, robot, largest_observation(robot, number), number);
     if (answered) return {};
     refused = answered.error();
-    if (refused.where == kActionTokens) return {};  // computed; grey frames may be answered with a text
     if (refused.code == Code::bad_action) is_finite = false, last = number;
     if (refused.code == Code::bad_action || refused.code == Code::bad_observation) continue;
     is_finite = true;
