@@ -74,7 +74,9 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     check_widths(policy, {})
     _check_words(policy)
     _note_ensemble(policy, checkpoint)
-    views, frames = _read_views(policy)
+    views, frames = cameras_of(policy)
+    if not views:
+        policy.bad("input_features", "a VISUAL feature or several", "none", "an ACT without cameras is not supported", unsupported=True)
     features = policy.get("input_features")
     has_environment = isinstance(features, dict) and ENVIRONMENT in features
     s = Sizes(
@@ -137,7 +139,7 @@ def _note_ensemble(policy: Section, checkpoint: Checkpoint) -> None:
         )
 
 
-def _read_views(policy: Section) -> Tuple[Sequence[str], Sequence[Tuple[int, int]]]:
+def cameras_of(policy: Section) -> Tuple[Sequence[str], Sequence[Tuple[int, int]]]:
     """Cameras in their order, and the sizes of their frames. What the reference does not read is refused: it may be a misspelt feature."""
     features = policy.get("input_features")
     views, sizes = [], []
@@ -152,9 +154,6 @@ def _read_views(policy: Section) -> Tuple[Sequence[str], Sequence[Tuple[int, int
                 policy.bad("input_features." + name, "a frame of shape [3, height, width]", str(shape))
         elif name not in (STATE, ENVIRONMENT):
             policy.bad("input_features." + name, "cameras, {} and {}".format(STATE, ENVIRONMENT), str(kind), unsupported=True)
-    if not views:
-        hint = "an ACT without cameras is not supported"
-        policy.bad("input_features", "a VISUAL feature or several", "none", hint, unsupported=True)
-    elif len(views) > MAX_VIEWS:
+    if len(views) > MAX_VIEWS:
         policy.bad("input_features", "at most {} cameras".format(MAX_VIEWS), str(len(views)), unsupported=True)
     return views, sizes or [(1, 1)]

@@ -16,7 +16,7 @@ from ...lerobot import action_width, check_keys, no_position_rule, state_width, 
 from ...recipe import STATE
 from ...section import Section
 from .. import Options
-from ..act.config import BACKBONES, ENVIRONMENT, MAX_SIDE
+from ..act.config import BACKBONES, ENVIRONMENT, MAX_SIDE, cameras_of
 
 # DiffusionConfig's keys that numbers depend on, with the defaults of the class.
 POLICY = {
@@ -234,22 +234,11 @@ def _image_sizes(policy: Section, frame: Tuple[int, int]) -> Tuple[Optional[Tupl
 
 
 def _read_cameras(policy: Section) -> Tuple[Sequence[str], Tuple[int, int]]:
-    """Cameras in their order, and the size of their frames. What the reference does not read is refused: it may be a misspelt feature."""
+    """Cameras in their order, and the size of their frames."""
     features = policy.get("input_features")
-    cameras, sizes = [], []
-    for name, feature in (features if isinstance(features, dict) else {}).items():
-        kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
-        if kind == "VISUAL":
-            cameras.append(name)
-            whole = isinstance(shape, list) and len(shape) == 3 and all(isinstance(n, int) and 0 < n <= MAX_SIDE for n in shape)
-            if whole and shape[0] == 3:
-                sizes.append((shape[2], shape[1]))
-            else:
-                policy.bad("input_features." + name, "a frame of shape [3, height, width]", str(shape))
-        elif name not in (STATE, ENVIRONMENT):
-            policy.bad("input_features." + name, "cameras, {} and {}".format(STATE, ENVIRONMENT), str(kind), unsupported=True)
+    cameras, sizes = cameras_of(policy)
     if not cameras and not (isinstance(features, dict) and ENVIRONMENT in features):
         policy.bad("input_features", "a VISUAL feature or several, or {}".format(ENVIRONMENT), "none", "the reference refuses it too")
     if len(set(sizes)) > 1:
         policy.bad("input_features", "cameras of one size", str(sizes), "the reference refuses others too")
-    return cameras, (sizes or [(1, 1)])[0]
+    return cameras, sizes[0]
