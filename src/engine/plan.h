@@ -101,8 +101,9 @@ class Plan {
   Slot *images_, *tokens_, *state_, *x_, *token_, *k_, *noise_, *target_, *keep_, *pull_;
   Slot* logits_ = nullptr;
   const Solver& solver_;
-  std::vector<float> decoded_;                 // tokens of this act
-  std::vector<float> read_logits_, no_token_;  // as the host reads them; what a slot of appended values starts from
+  std::vector<float> decoded_;      // tokens of this act
+  std::vector<float> read_logits_;  // the host's copy
+  std::vector<float> no_token_;     // zeros, which an act fills the slots of appended keys and values with
   std::uint64_t views_;
   TextLayout text_;
   Cache cache_;
