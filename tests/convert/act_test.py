@@ -9,7 +9,7 @@ import pytest
 
 from configs import of_config, sizes_of
 from goldens import act
-from manifests import check_keys, check_parameters
+from manifests import check_keys, check_parameters, sources
 from vla_cpp.convert import batch_norm
 from vla_cpp.convert.archs.act import mapping
 from vla_cpp.convert.archs.act.config import read_sizes
@@ -28,17 +28,10 @@ def sizes_at(config):
     return sizes_of(read_sizes, of_config(config))
 
 
-def sources(sizes):
-    out = {row.source: row.stored for row in [*mapping.weights(sizes), *mapping.dropped(sizes)]}
-    for row in mapping.weights(sizes):
-        out |= batch_norm.shapes(row.batch_norm, row.stored[0]) if row.batch_norm else {}
-    return out
-
-
 def test_the_published_config_asks_for_the_tensors_of_the_reference():
     sizes = sizes_at(PUBLISHED.config)
-    assert sources(sizes) == PUBLISHED.shapes()
-    assert sum(int(np.prod(shape)) for shape in sources(sizes).values()) == pytest.approx(51.6e6, rel=0.01)
+    assert sources(mapping, sizes) == PUBLISHED.shapes()
+    assert sum(int(np.prod(shape)) for shape in sources(mapping, sizes).values()) == pytest.approx(51.6e6, rel=0.01)
 
 
 def test_names_shapes_and_storage_are_those_that_the_runtime_declares():
@@ -52,7 +45,7 @@ def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest():
 @pytest.mark.parametrize("change", [{"pre_norm": True}, {"use_vae": False}, {"vision_backbone": "resnet34"}, {"n_decoder_layers": 7}])
 def test_every_arrangement_asks_for_the_tensors_of_the_reference(change):
     checkpoint = act.Checkpoint(act.policy(3, 8, 2, 12, (2, 1, 3)) | change, {"top": (33, 40)}, d_environment=5)
-    assert sources(sizes_at(checkpoint.config)) == checkpoint.shapes()
+    assert sources(mapping, sizes_at(checkpoint.config)) == checkpoint.shapes()
 
 
 def test_a_convolution_with_its_batch_norm_is_one_convolution(folder):

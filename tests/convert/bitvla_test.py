@@ -10,6 +10,7 @@ import pytest
 
 from goldens.bitvla import MICRO, STATISTICS, TWO_LAYERS
 from goldens.draw import bfloat16
+from saved import Saved
 from vla_cpp.convert.cli import main
 from vla_cpp.convert.errors import Code
 
@@ -17,20 +18,8 @@ SEED = 5
 HEAD, PROPRIO = "action_head--10000_checkpoint.pt", "proprio_projector--10000_checkpoint.pt"
 
 
-class Saved:
-    """A checkpoint of tools/goldens, to be changed after it was written."""
-
-    def __init__(self, checkpoint=MICRO, **changes):
-        self.checkpoint, self.changes = checkpoint, changes
-
-    def save(self, folder):
-        shutil.rmtree(folder, ignore_errors=True)
-        self.checkpoint.write(SEED, folder)
-        for file, change in self.changes.items():
-            path = folder / (file + ".json")
-            content = json.loads(path.read_text())
-            change(content)
-            path.write_text(json.dumps(content))
+def saved(checkpoint=MICRO, **changes):
+    return Saved(checkpoint, SEED, **changes)
 
 
 def value(name, file="model", checkpoint=MICRO):
@@ -44,7 +33,7 @@ def numbers(codes):
 
 
 def test_codes_and_scales_are_those_of_the_reference(converter):
-    bundle = converter.bundle(Saved(TWO_LAYERS))
+    bundle = converter.bundle(saved(TWO_LAYERS))
     names = {
         "vision.blk.1.ffn_down": "vision_tower.vision_model.encoder.layers.1.mlp.fc2.weight",
         "vision.blk.0.attn_out": "vision_tower.vision_model.encoder.layers.0.self_attn.out_proj.weight",
@@ -63,7 +52,7 @@ def test_codes_and_scales_are_those_of_the_reference(converter):
 
 
 def test_a_number_near_where_its_code_changes_is_told(converter, capsys):
-    converter.save(Saved())
+    converter.save(saved())
     assert main([str(converter.folder), "-o", converter.out]) == 0
     assert "WARNING" in capsys.readouterr().out  # layer 0 has numbers that round from exactly a half
 
@@ -72,16 +61,16 @@ def test_numbers_that_the_reference_rounds_at_load_are_rounded(converter):
     w = value("fc1.weight", "proprio_projector")
     assert (w != bfloat16(w)).any()
     for dtype in ("f32", "bf16"):
-        bundle = converter.bundle(Saved(), dtype=dtype)
+        bundle = converter.bundle(saved(), dtype=dtype)
         stored = bundle.tensors["state_in.weight"]
         stored = stored if dtype == "f32" else (stored.astype(np.uint32) << 16).view(np.float32)
         assert (stored == bfloat16(w)).all()
         assert (bundle.tensors["state_in.bias"] == bfloat16(value("fc1.bias", "proprio_projector"))).all()
-    assert converter.bundle(Saved()).keys["vla.dtype"] == "bf16"
+    assert converter.bundle(saved()).keys["vla.dtype"] == "bf16"
 
 
 def test_statistics_stay_doubles_and_the_gripper_is_not_stretched(converter):
-    bundle = converter.bundle(Saved())
+    bundle = converter.bundle(saved())
     expected = MICRO.statistics(SEED)
     for feature, key in (("observation.state", "proprio"), ("action", "action")):
         for quantile in ("q01", "q99"):
@@ -97,27 +86,27 @@ def test_statistics_stay_doubles_and_the_gripper_is_not_stretched(converter):
 
 
 def test_views_stand_behind_the_system_sentence_and_the_users_name(converter):
-    keys = converter.bundle(Saved()).keys
+    keys = converter.bundle(saved()).keys
     starts = keys["policy.view_starts"]
     assert starts[1] - starts[0] == 4 and keys["policy.max_views"] == 2
     assert keys["policy.stop_token"] == 377 and keys["tokenizer.prefix_ids"] == [376]
     assert keys["observation.views"] == ["observation.images.image", "observation.images.image2"]
-    assert converter.bundle(Saved(), views=["a", "b", "c"]).keys["policy.view_starts"] == [starts[0] + 4 * i for i in range(3)]
+    assert converter.bundle(saved(), views=["a", "b", "c"]).keys["policy.view_starts"] == [starts[0] + 4 * i for i in range(3)]
 
 
 def test_shards_prefixes_and_spellings_make_one_bundle(converter, tmp_path):
     def content(bundle):
         return {name: tensor.tobytes() for name, tensor in bundle.tensors.items()}
 
-    first = converter.bundle(Saved())
-    assert content(converter.bundle(Saved(config=lambda c: c.update(model_type="openvla")))) == content(first)
-    assert content(converter.bundle(Saved(config=lambda c: c.update(vision_feature_layer=1)))) == content(first)
-    whole = Saved(type(MICRO)(MICRO.vision, MICRO.text, n_shard=1))
+    first = converter.bundle(saved())
+    assert content(converter.bundle(saved(config=lambda c: c.update(model_type="openvla")))) == content(first)
+    assert content(converter.bundle(saved(config=lambda c: c.update(vision_feature_layer=1)))) == content(first)
+    whole = saved(type(MICRO)(MICRO.vision, MICRO.text, n_shard=1))
     assert content(converter.bundle(whole)) == content(first)
 
 
 def test_layers_behind_the_one_that_is_read_are_dropped(converter):
-    bundle = converter.bundle(Saved(TWO_LAYERS, config=lambda c: c.update(vision_feature_layer=-2)))
+    bundle = converter.bundle(saved(TWO_LAYERS, config=lambda c: c.update(vision_feature_layer=-2)))
     assert bundle.keys["vision.n_layer"] == 1
     assert not any(name.startswith("vision.blk.1") for name in bundle.tensors)
 
@@ -165,17 +154,17 @@ REFUSED = [
 
 @pytest.mark.parametrize("changes, part, code", REFUSED, ids=[part for _, part, _ in REFUSED])
 def test_what_is_not_understood_is_refused_by_name(converter, changes, part, code):
-    error = converter.refusal(Saved(**changes))
+    error = converter.refusal(saved(**changes))
     assert part in str(error) and error.code == code
 
 
 def test_statistics_of_a_data_set_are_chosen_by_name(converter):
-    both = Saved(dataset_statistics=lambda s: s.update(other=s[STATISTICS]))
+    both = saved(dataset_statistics=lambda s: s.update(other=s[STATISTICS]))
     assert converter.bundle(both, stats="other").keys["vla.arch"] == "bitvla"
 
 
 def test_a_missing_sidecar_and_one_of_another_step_are_refused_by_name(converter):
-    converter.save(Saved())
+    converter.save(saved())
     (converter.folder / HEAD).rename(converter.folder / "head.pt")
     assert "action_head--STEP_checkpoint.pt: expected one such file, found none" in str(converter.refusal())
     (converter.folder / "head.pt").rename(converter.folder / HEAD)
@@ -188,9 +177,9 @@ def test_a_missing_sidecar_and_one_of_another_step_are_refused_by_name(converter
 
 def test_a_head_of_another_robot_is_refused(converter):
     checkpoint = type(MICRO)(MICRO.vision, MICRO.text, d_state=7)
-    assert "which are LIBERO's" in str(converter.refusal(Saved(checkpoint)))
+    assert "which are LIBERO's" in str(converter.refusal(saved(checkpoint)))
 
 
 def test_widths_that_share_no_byte_are_refused(converter):
     odd = type(MICRO)({**MICRO.vision, "intermediate_size": 46}, MICRO.text)
-    assert "intermediate_size: expected a multiple of 4" in str(converter.refusal(Saved(odd)))
+    assert "intermediate_size: expected a multiple of 4" in str(converter.refusal(saved(odd)))

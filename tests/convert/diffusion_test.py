@@ -10,8 +10,7 @@ import pytest
 
 from configs import of_config, sizes_of
 from goldens import diffusion
-from manifests import check_keys, check_parameters
-from vla_cpp.convert import batch_norm
+from manifests import check_keys, check_parameters, sources
 from vla_cpp.convert.archs.diffusion import mapping
 from vla_cpp.convert.archs.diffusion.config import read_sizes
 
@@ -26,17 +25,10 @@ def sizes_at(config):
     return sizes_of(read_sizes, of_config(config))
 
 
-def sources(sizes):
-    out = {row.source: row.stored for row in [*mapping.weights(sizes), *mapping.dropped(sizes)]}
-    for row in mapping.weights(sizes):
-        out |= batch_norm.shapes(row.batch_norm, row.stored[0]) if row.batch_norm else {}
-    return out
-
-
 def test_the_published_config_asks_for_the_tensors_of_the_reference():
     sizes = sizes_at(PUBLISHED.config)
-    assert sources(sizes) == PUBLISHED.shapes()
-    assert sum(int(np.prod(shape)) for shape in sources(sizes).values()) == pytest.approx(262.7e6, rel=0.01)
+    assert sources(mapping, sizes) == PUBLISHED.shapes()
+    assert sum(int(np.prod(shape)) for shape in sources(mapping, sizes).values()) == pytest.approx(262.7e6, rel=0.01)
 
 
 def test_names_shapes_and_storage_are_those_that_the_runtime_declares():
@@ -63,7 +55,7 @@ def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest():
 )
 def test_every_arrangement_asks_for_the_tensors_of_the_reference(change):
     checkpoint = replace(SMALL, policy=POLICY | change)
-    assert sources(sizes_at(checkpoint.config)) == checkpoint.shapes()
+    assert sources(mapping, sizes_at(checkpoint.config)) == checkpoint.shapes()
 
 
 def test_a_policy_without_cameras_has_no_views(planned):

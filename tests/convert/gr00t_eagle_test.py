@@ -9,25 +9,13 @@ import pytest
 
 from goldens import gr00t_n1_5, gr00t_n1_6
 from goldens.parameters import parameter
+from saved import Changed
 from vla_cpp.convert.archs import gr00t_n1_5 as n1_5
 from vla_cpp.convert.archs.gr00t_n1_5 import CONFIGS
 from vla_cpp.convert.errors import Code
 
 N1_5, N1_6 = gr00t_n1_5.CASES["gr00t_n1_5/libero"], gr00t_n1_6.CASES["gr00t_n1_6/libero"]
 DATA, META = "data_config.json", "experiment_cfg/metadata.json"
-
-
-class Changed:
-    """A case's checkpoint, one of whose JSON files is changed before it is converted."""
-
-    def __init__(self, case, file="config.json", change=lambda content: None):
-        self.case, self.file, self.change = case, file, change
-
-    def save(self, folder):
-        self.case.checkpoint.write(self.case.seed, folder)
-        content = json.loads((folder / self.file).read_text())
-        self.change(content)
-        (folder / self.file).write_text(json.dumps(content))
 
 
 def recipe(bundle):

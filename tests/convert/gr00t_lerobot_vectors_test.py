@@ -8,25 +8,13 @@ import numpy as np
 import pytest
 from goldens import groot
 from goldens.files import write_safetensors
+from saved import Changed
 from vla_cpp.convert.errors import Code
 from vla_cpp.convert.safetensors_file import read_safetensors
 
 N1_5, N1_7 = groot.CASES["groot/n1_5"], groot.CASES["groot/n1_7"]
 PRE, POST, CONFIG, BASE = "policy_preprocessor.json", "policy_postprocessor.json", "config.json", "base/config.json"
 RECIPE = "processor.recipe"
-
-
-class Changed:
-    """A case's checkpoint, one of whose JSON files is changed before it is converted."""
-
-    def __init__(self, case, file=CONFIG, change=lambda content: None):
-        self.case, self.file, self.change = case, file, change
-
-    def save(self, folder):
-        self.case.checkpoint.write(self.case.seed, folder)
-        content = json.loads((folder / self.file).read_text())
-        self.change(content)
-        (folder / self.file).write_text(json.dumps(content))
 
 
 class Counted(Changed):

@@ -9,6 +9,8 @@ import subprocess
 
 import pytest
 
+from vla_cpp.convert import batch_norm
+
 
 def vla():
     """The built program, named by VLA_BINARY or where the build puts it."""
@@ -40,3 +42,11 @@ def check_keys(arch, keys, chosen=()):
     for name, value in manifest(arch)["config"].items():
         if name not in chosen:
             assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+
+
+def sources(mapping, sizes):
+    """Shapes of all tensors of a checkpoint that a mapping reads or drops, with those of the batch norms that it folds."""
+    out = {row.source: row.stored for row in [*mapping.weights(sizes), *mapping.dropped(sizes)]}
+    for row in mapping.weights(sizes):
+        out |= batch_norm.shapes(row.batch_norm, row.stored[0]) if row.batch_norm else {}
+    return out

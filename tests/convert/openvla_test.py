@@ -3,7 +3,6 @@
 """OpenVLA: names against the reference's and the runtime's, pixels that the towers standardize, statistics, prompt, refusals."""
 
 import json
-import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,6 +13,7 @@ from goldens import openvla
 from goldens.openvla import CASES, EMPTY, LM, MEANS, STDS, Tower
 from goldens.parameters import decoder
 from manifests import check_keys, check_parameters
+from saved import Saved
 from tokenizer_from_keys import ids_of, tokenizer_of
 from vla_cpp.convert.archs.openvla import mapping
 from vla_cpp.convert.errors import Code, Problems
@@ -23,22 +23,8 @@ SMALL = openvla.Checkpoint(Tower(16, 2, 20), Tower(32, 3, 28), decoder(16, 2, 2,
 PIXELS = [{"mean": tuple(mean), "std": tuple(std)} for mean, std in zip(MEANS, STDS)]
 
 
-class Saved:
-    """A checkpoint of tools/goldens, to be changed after it was written."""
-
-    def __init__(self, checkpoint=SMALL, without=(), **changes):
-        self.checkpoint, self.without, self.changes = checkpoint, without, changes
-
-    def save(self, folder):
-        shutil.rmtree(folder, ignore_errors=True)
-        self.checkpoint.write(SEED, folder)
-        for name, change in self.changes.items():
-            file = folder / (name + ".json")
-            content = json.loads(file.read_text())
-            change(content)
-            file.write_text(json.dumps(content))
-        for name in self.without:
-            (folder / name).unlink()
+def saved(checkpoint=SMALL, **changes):
+    return Saved(checkpoint, SEED, **changes)
 
 
 def sizes_of(checkpoint, **config):
@@ -79,7 +65,7 @@ def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(publis
 
 def test_the_stored_weights_read_pixels_from_0_to_1(converter):
     """The sum of a patch, of which the reference standardizes the pixels first."""
-    bundle = converter.bundle(Saved(), dtype="bf16", stats="bridge_orig")
+    bundle = converter.bundle(saved(), dtype="bf16", stats="bridge_orig")
     pixels = np.random.default_rng(0).random((3, 14, 14))
     for at, source, mean, std in (("dino", openvla.DINO, MEANS[0], STDS[0]), ("siglip", openvla.SIGLIP, MEANS[1], STDS[1])):
         weight, bias = (SMALL.value(name, SMALL.shapes()[name], SEED) for name in (f"{source}patch_embed.proj.{part}" for part in ("weight", "bias")))
@@ -92,7 +78,7 @@ def test_the_stored_weights_read_pixels_from_0_to_1(converter):
 
 
 def test_q_k_and_v_are_thirds_of_one_matrix(converter):
-    tensors = converter.bundle(Saved(), dtype="f32").tensors
+    tensors = converter.bundle(saved(), dtype="f32").tensors
     name = openvla.SIGLIP + "blocks.1.attn.qkv.weight"
     stacked = SMALL.value(name, SMALL.shapes()[name], SEED)
     for i, part in enumerate("qkv"):
@@ -102,13 +88,13 @@ def test_q_k_and_v_are_thirds_of_one_matrix(converter):
 
 
 def test_tokens_of_actions_end_the_vocabulary_without_its_padding(converter):
-    keys = converter.bundle(Saved()).keys
+    keys = converter.bundle(saved()).keys
     assert keys["action_tokens.kind"] == "bins" and keys["action_tokens.n_bin"] == 256
     assert keys["action_tokens.first_id"] == openvla.N_TOKEN - 1 and keys["lm.n_vocab"] == openvla.N_TOKEN + 64
     assert keys["solver.kind"] == "greedy" and keys["solver.steps"] == 7 and keys["solver.stop_token"] == 2
-    other = converter.bundle(Saved(generation_config=lambda c: c.update(eos_token_id=5)))
+    other = converter.bundle(saved(generation_config=lambda c: c.update(eos_token_id=5)))
     assert other.keys["solver.stop_token"] == 5
-    unstated = Saved(without=["generation_config.json"], config=lambda c: c["text_config"].update(eos_token_id=6))
+    unstated = saved(without=["generation_config.json"], config=lambda c: c["text_config"].update(eos_token_id=6))
     assert converter.bundle(unstated).keys["solver.stop_token"] == 6
 
 
@@ -116,11 +102,11 @@ def test_shards_make_the_same_bundle(converter):
     def content(bundle):
         return {name: tensor.tobytes() for name, tensor in bundle.tensors.items()}
 
-    assert content(converter.bundle(Saved(replace(SMALL, n_shard=3)))) == content(converter.bundle(Saved()))
+    assert content(converter.bundle(saved(replace(SMALL, n_shard=3)))) == content(converter.bundle(saved()))
 
 
 def test_the_prompt_ends_with_the_empty_token(converter):
-    bundle = converter.bundle(Saved())
+    bundle = converter.bundle(saved())
     text = json.loads(bundle.keys["processor.recipe"])["text"]
     assert [op["op"] for op in text] == ["lower", "template", "tokenize"]
     tokenizer = tokenizer_of(bundle.keys)
@@ -132,7 +118,7 @@ def test_the_prompt_ends_with_the_empty_token(converter):
 
 def test_statistics_are_chosen_by_their_data_set(converter):
     several = replace(SMALL, other_stats=("fractal", "taco_play"))
-    error = converter.refusal(Saved(several))
+    error = converter.refusal(saved(several))
     assert "expected one of bridge_orig, fractal, taco_play, found 3" in str(error)
     assert "found nowhere" in str(converter.refusal(stats="nowhere"))
     bundle = converter.bundle(stats="fractal")
@@ -146,7 +132,7 @@ def test_statistics_are_chosen_by_their_data_set(converter):
 
 def test_a_fine_tune_has_statistics_of_its_own(converter):
     case = CASES["openvla/fine_tuned"].checkpoint
-    bundle = converter.bundle(Saved(case))
+    bundle = converter.bundle(saved(case))
     assert bundle.tensors["stats.action.q01"].tolist() == case.statistics(SEED)["bridge_orig"]["action"]["q01"]
     (op,) = json.loads(bundle.keys["processor.recipe"])["action"]
     assert op["columns"] == [0, 1, 2, 3] and bundle.keys["policy.d_action"] == bundle.keys["solver.steps"] == 4
@@ -211,18 +197,18 @@ REFUSED = [
 
 @pytest.mark.parametrize("changes, part, code", REFUSED, ids=[str(i) + " " + part for i, (_, part, _) in enumerate(REFUSED)])
 def test_what_is_not_understood_is_refused_by_name(converter, changes, part, code):
-    error = converter.refusal(Saved(**changes))
+    error = converter.refusal(saved(**changes))
     assert part in str(error) and code in {problem.code for problem in error.problems}
 
 
 def test_the_head_of_another_policy_beside_it_is_refused(converter):
-    converter.save(Saved())
+    converter.save(saved())
     (converter.folder / "action_head--150000_checkpoint.pt").write_bytes(b"")
     error = converter.refusal()
     assert "OpenVLA-OFT" in str(error) and error.code == Code.UNSUPPORTED
 
 
 def test_there_is_one_camera(converter):
-    assert "one camera" in str(converter.refusal(Saved(), views=["a", "b"]))
+    assert "one camera" in str(converter.refusal(saved(), views=["a", "b"]))
     keys = converter.bundle(views=["top"]).keys
     assert keys["observation.views"] == ["observation.images.top"] and keys["observation.states"] == []

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from goldens import turbovla_authors as authors
-from goldens.files import write_json
 from manifests import check_keys, check_parameters
+from saved import Saved
 from vla_cpp.convert.archs import Options
 from vla_cpp.convert.archs import authors as layouts
 from vla_cpp.convert.archs.turbovla_authors import mapping
@@ -30,23 +30,8 @@ def changed(part, **values):
     return replace(SMALL, parts={**PARTS, part: {**PARTS[part], **values}})
 
 
-class Saved:
-    """A checkpoint of tools/goldens, to be changed after it was written."""
-
-    def __init__(self, checkpoint=SMALL, without=(), **changes):
-        self.checkpoint, self.without, self.changes = checkpoint, without, changes
-
-    def save(self, folder):
-        shutil.rmtree(folder, ignore_errors=True)
-        self.checkpoint.write(SEED, folder)
-        for name, change in self.changes.items():
-            file = next(folder.glob("**/{}.json".format(name)))
-            content = json.loads(file.read_text())
-            change(content)
-            write_json(file, content)
-        for name in self.without:
-            path = folder / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+def saved(checkpoint=SMALL, **changes):
+    return Saved(checkpoint, SEED, **changes)
 
 
 def sizes_at(checkpoint, folder, **options):
@@ -91,7 +76,7 @@ def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(tmp_pa
 
 
 def test_the_recipe_is_that_of_the_reference(converter):
-    keys = converter.bundle(Saved(), vision_tokens="normed").keys
+    keys = converter.bundle(saved(), vision_tokens="normed").keys
     recipe = json.loads(keys["processor.recipe"])
     size = {"width": 8, "height": 8}
     assert recipe["image"][:2] == [{"op": "camera_size", **size}, {"op": "size", **size}]
@@ -107,7 +92,7 @@ def test_the_recipe_is_that_of_the_reference(converter):
 
 
 def test_ends_of_sentences_are_the_tokenizers(converter):
-    keys = converter.bundle(Saved(), vision_tokens="normed").keys
+    keys = converter.bundle(saved(), vision_tokens="normed").keys
     assert [keys["tokenizer.tokens"][i] for i in keys["policy.sentence_ends"]] == ["[CLS]", "[SEP]", ".", "?"]
     assert keys["tokenizer.tokens"][keys["policy.text_end"]] == "[SEP]"
 
@@ -116,13 +101,13 @@ def test_an_end_that_the_tokenizer_does_not_have_is_its_unknown_token(converter)
     def without_question_mark(spec):
         del spec["model"]["vocab"]["?"]
 
-    keys = converter.bundle(Saved(tokenizer=without_question_mark), vision_tokens="normed").keys
+    keys = converter.bundle(saved(tokenizer=without_question_mark), vision_tokens="normed").keys
     assert keys["policy.sentence_ends"][3] == keys["tokenizer.unknown_id"]
 
 
 def test_statistics_are_those_of_proprio_and_the_arm(converter):
     stated = SMALL.statistics(SEED)["libero_all4_no_noops"]
-    bundle = converter.bundle(Saved(), vision_tokens="normed")
+    bundle = converter.bundle(saved(), vision_tokens="normed")
     for name, values in {"observation.state.mean": stated["proprio"]["mean"], "action.max": stated["action"]["max"]}.items():
         assert np.array_equal(bundle.tensors["stats." + name], np.float32(values))
 
@@ -131,34 +116,34 @@ def test_without_proprio_the_state_is_read(converter):
     def without_proprio(content):
         del content["libero_all4_no_noops"]["proprio"]
 
-    assert converter.bundle(Saved(libero_all4_stats=without_proprio), vision_tokens="normed").tensors["stats.observation.state.mean"].tolist() == [0] * 8
+    assert converter.bundle(saved(libero_all4_stats=without_proprio), vision_tokens="normed").tensors["stats.observation.state.mean"].tolist() == [0] * 8
 
 
 def test_one_of_several_data_sets_is_chosen(converter):
     several = replace(SMALL, other_stats=("goal",))
-    assert "expected one of libero_all4_no_noops, goal, found several" in str(converter.refusal(Saved(several), vision_tokens="normed"))
+    assert "expected one of libero_all4_no_noops, goal, found several" in str(converter.refusal(saved(several), vision_tokens="normed"))
     stated = several.statistics(SEED)["goal"]["action"]["min"]
-    bundle = converter.bundle(Saved(several), vision_tokens="normed", stats="goal")
+    bundle = converter.bundle(saved(several), vision_tokens="normed", stats="goal")
     assert np.array_equal(bundle.tensors["stats.action.min"], np.float32(stated))
 
 
 def test_the_last_norm_of_the_tower_is_left_out_where_the_policy_does_not_read_it(converter):
-    assert "vision.post_norm.weight" in converter.bundle(Saved(), vision_tokens="normed").tensors
-    assert "vision.post_norm.weight" not in converter.bundle(Saved(), vision_tokens="last_block").tensors
+    assert "vision.post_norm.weight" in converter.bundle(saved(), vision_tokens="normed").tensors
+    assert "vision.post_norm.weight" not in converter.bundle(saved(), vision_tokens="last_block").tensors
 
 
 @pytest.mark.parametrize("member", ["model_state_dict", "model", "state_dict"])
 def test_weights_are_found_under_every_name_that_the_reference_knows(converter, member):
-    assert converter.bundle(Saved(replace(SMALL, member=member)), vision_tokens="normed").keys["vla.arch"] == "turbovla_authors"
+    assert converter.bundle(saved(replace(SMALL, member=member)), vision_tokens="normed").keys["vla.arch"] == "turbovla_authors"
 
 
 def test_transformers_5_calls_the_layers_of_the_tower_otherwise(converter):
-    bundle = converter.bundle(Saved(replace(SMALL, layers="model.layer")), vision_tokens="last_block")
+    bundle = converter.bundle(saved(replace(SMALL, layers="model.layer")), vision_tokens="last_block")
     assert "vision.blk.0.attn_q.weight" in bundle.tensors
 
 
 def test_which_tokens_of_the_tower_is_asked_for(converter):
-    error = converter.refusal(Saved())
+    error = converter.refusal(saved())
     assert "--vision-tokens: expected normed or last_block, found none" in str(error) and error.code == Code.USAGE
 
 
@@ -183,12 +168,12 @@ def test_which_tokens_of_the_tower_is_asked_for(converter):
     ],
 )
 def test_what_the_runtime_does_not_do_is_refused_by_name(converter, part, values, message):
-    assert message in str(converter.refusal(Saved(changed(part, **values)), vision_tokens="normed"))
+    assert message in str(converter.refusal(saved(changed(part, **values)), vision_tokens="normed"))
 
 
 def test_fields_that_no_number_depends_on_are_passed_over(converter):
     with_them = changed("interaction", fusion_droppath=0.5, attention_backend="sdpa", compute_precision="bf16_autocast")
-    assert converter.bundle(Saved(with_them), vision_tokens="normed").keys["fusion.n_head"] == 2
+    assert converter.bundle(saved(with_them), vision_tokens="normed").keys["fusion.n_head"] == 2
 
 
 def drop(name):
@@ -201,14 +186,14 @@ def drop(name):
 @pytest.mark.parametrize(
     ("saved", "message"),
     [
-        (Saved(without=["libero_all4_stats.json"]), "one file *stats*.json, the statistics, found none"),
-        (Saved(without=["language_encoder"]), "--backbone DIR, or language_encoder/ inside the checkpoint"),
-        (Saved(without=["vision_encoder"]), "a DINOv3 of facebook/dinov3-vits16-pretrain-lvd1689m"),
-        (Saved(preprocessor_config=lambda c: c.update(rescale_factor=1.0)), "rescale_factor: expected 1 / 255, found 1.0"),
-        (Saved(preprocessor_config=lambda c: c.update(image_std=[0.0, 1.0, 1.0])), "image_std: expected three numbers"),
-        (Saved(libero_all4_stats=lambda c: c["libero_all4_no_noops"]["action"]["max"].pop()), "action.max: expected 7 finite numbers"),
-        (Saved(libero_all4_stats=lambda c: drop("std")(c["libero_all4_no_noops"]["proprio"])), "proprio.std: expected 8 finite numbers"),
-        (Saved(tokenizer_config=lambda c: c.update(truncation_side="left")), "truncation_side: expected 'right'"),
+        (saved(without=["libero_all4_stats.json"]), "one file *stats*.json, the statistics, found none"),
+        (saved(without=["language_encoder"]), "--backbone DIR, or language_encoder/ inside the checkpoint"),
+        (saved(without=["vision_encoder"]), "a DINOv3 of facebook/dinov3-vits16-pretrain-lvd1689m"),
+        (saved(preprocessor_config=lambda c: c.update(rescale_factor=1.0)), "rescale_factor: expected 1 / 255, found 1.0"),
+        (saved(preprocessor_config=lambda c: c.update(image_std=[0.0, 1.0, 1.0])), "image_std: expected three numbers"),
+        (saved(libero_all4_stats=lambda c: c["libero_all4_no_noops"]["action"]["max"].pop()), "action.max: expected 7 finite numbers"),
+        (saved(libero_all4_stats=lambda c: drop("std")(c["libero_all4_no_noops"]["proprio"])), "proprio.std: expected 8 finite numbers"),
+        (saved(tokenizer_config=lambda c: c.update(truncation_side="left")), "truncation_side: expected 'right'"),
     ],
 )
 def test_files_that_are_missing_or_say_something_else_are_refused(converter, saved, message):
@@ -247,6 +232,6 @@ def test_missing_misshapen_and_foreign_tensors_are_refused(converter, change, me
 
 
 def test_two_files_of_weights_are_refused(converter):
-    converter.save(Saved())
+    converter.save(saved())
     shutil.copy(converter.folder / "policy.pth", converter.folder / "other.pth")
     assert "one file *.pth, the weights, found other.pth, policy.pth" in str(converter.refusal(vision_tokens="normed"))

@@ -30,6 +30,38 @@ CONFIG = {
     "optimizer_lr": 1e-5, "optimizer_weight_decay": 1e-4, "optimizer_lr_backbone": 1e-5}
 
 
+def camera_statistics(seed):
+    generator = Generator(seed)
+    mean, std = generator.uniform(3) * f32(0.3) + f32(0.3), generator.uniform(3) * f32(0.2) + f32(0.15)
+    ranges = {"min": mean - std, "max": mean + std, "q01": mean - f32(0.9) * std, "q99": mean + std, "q10": mean - f32(0.5) * std, "q90": mean + f32(0.6) * std}
+    return {k: v.reshape(3, 1, 1) for k, v in ({"mean": mean, "std": std} | ranges).items()}
+
+
+def write(checkpoint, dtypes, seed, folder):
+    """config.json, model.safetensors, both pipelines or statistics among the weights.  Returns the parameter count."""
+    folder, c, shapes = Path(folder), checkpoint.config, checkpoint.shapes()
+    write_json(folder / "config.json", c, indent=2)
+    numbers = {}
+    if checkpoint.old:
+        for feature, table in checkpoint.statistics(seed).items():
+            for group in ("normalize_inputs", "normalize_targets", "unnormalize_outputs"):
+                if (feature == "action") == (group != "normalize_inputs"):
+                    numbers |= {f"{group}.buffer_{feature.replace('.', '_')}.{k}": table[k] for k in checkpoint.old_parts(feature)}
+    else:
+        shown, actions, modes = c["input_features"], c["output_features"], c["normalization_mapping"]
+        before = [layout.rename({}), layout.BATCH, layout.device(), layout.normalizer("normalizer_processor", shown | actions, modes)]
+        after = [layout.normalizer("unnormalizer_processor", actions, modes), layout.device()]
+        layout.write_pipelines(folder, before, after, checkpoint.statistics(seed))
+    listed = {name: (dtypes[name], shape) for name, shape in shapes.items()} | {name: ("F32", x.shape) for name, x in numbers.items()}
+
+    def value(name):
+        x = numbers[name] if name in numbers else checkpoint.value(name, shapes[name], seed)
+        return bfloat16_bits(x) if dtypes.get(name) == "BF16" else x
+
+    write_stream(folder / "model.safetensors", dict(sorted(listed.items())), value)
+    return sum(map(layout.count, shapes.values()))
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """What differs from ACTConfig's defaults, features.  exact: scales of batch norms are powers of two, with which products of weights
@@ -101,38 +133,18 @@ class Checkpoint:
     def statistics(self, seed):
         out = statistics(self.d_state, self.d_action, seed, self.zero_spread)
         for i, view in enumerate(self.views):
-            generator = Generator(seed + 55 + (0 if self.imagenet else i))
-            mean, std = generator.uniform(3) * f32(0.3) + f32(0.3), generator.uniform(3) * f32(0.2) + f32(0.15)
-            ranges = {"min": mean - std, "max": mean + std, "q01": mean - f32(0.9) * std, "q99": mean + std, "q10": mean - f32(0.5) * std, "q90": mean + f32(0.6) * std}
-            out[f"observation.images.{view}"] = {k: v.reshape(3, 1, 1) for k, v in ({"mean": mean, "std": std} | ranges).items()}
+            out[f"observation.images.{view}"] = camera_statistics(seed + 55 + (0 if self.imagenet else i))
         if self.d_environment:
             out[ENVIRONMENT] = statistics(self.d_environment, 1, seed + 5)["observation.state"]
         return out
 
+    def old_parts(self, feature):
+        """Statistics of a feature that the older layout keeps among the weights."""
+        return "mean", "std"
+
     def write(self, seed, folder):
-        """config.json, model.safetensors, both pipelines or statistics among the weights.  Returns the parameter count."""
-        folder, c, shapes = Path(folder), self.config, self.shapes()
-        write_json(folder / "config.json", c, indent=2)
-        numbers = {}
-        if self.old:
-            for feature, table in self.statistics(seed).items():
-                for group in ("normalize_inputs", "normalize_targets", "unnormalize_outputs"):
-                    if (feature == "action") == (group != "normalize_inputs"):
-                        numbers |= {f"{group}.buffer_{feature.replace('.', '_')}.{k}": table[k] for k in ("mean", "std")}
-        else:
-            shown, actions, modes = c["input_features"], c["output_features"], c["normalization_mapping"]
-            before = [layout.rename({}), layout.BATCH, layout.device(), layout.normalizer("normalizer_processor", shown | actions, modes)]
-            after = [layout.normalizer("unnormalizer_processor", actions, modes), layout.device()]
-            layout.write_pipelines(folder, before, after, self.statistics(seed))
-        dtypes = {name: self.dtype if len(shape) == 4 and "backbone" in name else "F32" for name, shape in shapes.items()}
-        listed = {name: (dtypes[name], shape) for name, shape in shapes.items()} | {name: ("F32", x.shape) for name, x in numbers.items()}
-
-        def value(name):
-            x = numbers[name] if name in numbers else self.value(name, shapes[name], seed)
-            return bfloat16_bits(x) if dtypes.get(name) == "BF16" else x
-
-        write_stream(folder / "model.safetensors", dict(sorted(listed.items())), value)
-        return sum(map(layout.count, shapes.values()))
+        dtypes = {name: self.dtype if len(shape) == 4 and "backbone" in name else "F32" for name, shape in self.shapes().items()}
+        return write(self, dtypes, seed, folder)
 
 
 def filters(name, shape, seed):

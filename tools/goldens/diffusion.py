@@ -8,15 +8,14 @@ The towers are torchvision's own ResNet-18 and -34, which have one width only: f
 import functools
 import zlib
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from . import act
 from . import lerobot_layout as layout
+from .act import camera_statistics, write
 from .cases import Case
-from .draw import Generator, bfloat16, f32
-from .files import bfloat16_bits, write_json, write_stream
+from .draw import bfloat16, f32
 from .parameters import linear, norm, parameter, statistics
 from .recorder import Taps
 
@@ -153,40 +152,19 @@ class Checkpoint:
     def statistics(self, seed):
         out = statistics(self.d_state, self.d_action, seed, self.zero_spread)
         for camera in self.cameras:
-            generator = Generator(zlib.crc32(camera.encode()) + seed)
-            mean, std = generator.uniform(3) * f32(0.3) + f32(0.3), generator.uniform(3) * f32(0.2) + f32(0.15)
-            ranges = {"min": mean - std, "max": mean + std, "q01": mean - f32(0.9) * std, "q99": mean + std, "q10": mean - f32(0.5) * std, "q90": mean + f32(0.6) * std}
-            out[f"observation.images.{camera}"] = {k: v.reshape(3, 1, 1) for k, v in ({"mean": mean, "std": std} | ranges).items()}
+            out[f"observation.images.{camera}"] = camera_statistics(zlib.crc32(camera.encode()) + seed)
         if self.d_environment:
             out[ENVIRONMENT] = statistics(self.d_environment, 1, seed + 5)["observation.state"]
         return out
 
+    def old_parts(self, feature):
+        """Statistics of a feature that the older layout keeps among the weights."""
+        mode = self.config["normalization_mapping"]["ACTION" if feature == "action" else "STATE" if feature == "observation.state" else "VISUAL"]
+        return ("mean", "std") if mode == "MEAN_STD" else ("min", "max")
+
     def write(self, seed, folder):
-        """config.json, model.safetensors, both pipelines or statistics among the weights.  Returns the parameter count."""
-        folder, c, shapes = Path(folder), self.config, self.shapes()
-        write_json(folder / "config.json", c, indent=2)
-        numbers = {}
-        if self.old:
-            for feature, table in self.statistics(seed).items():
-                mode = c["normalization_mapping"]["ACTION" if feature == "action" else "STATE" if feature == "observation.state" else "VISUAL"]
-                for group in ("normalize_inputs", "normalize_targets", "unnormalize_outputs"):
-                    if (feature == "action") == (group != "normalize_inputs"):
-                        parts = ("mean", "std") if mode == "MEAN_STD" else ("min", "max")
-                        numbers |= {f"{group}.buffer_{feature.replace('.', '_')}.{k}": table[k] for k in parts}
-        else:
-            shown, actions, modes = c["input_features"], c["output_features"], c["normalization_mapping"]
-            before = [layout.rename({}), layout.BATCH, layout.device(), layout.normalizer("normalizer_processor", shown | actions, modes)]
-            after = [layout.normalizer("unnormalizer_processor", actions, modes), layout.device()]
-            layout.write_pipelines(folder, before, after, self.statistics(seed))
-        dtypes = {name: self.dtype if len(shape) > 1 and "pos_grid" not in name else "F32" if shape else "I64" for name, shape in shapes.items()}
-        listed = {name: (dtypes[name], shape) for name, shape in shapes.items()} | {name: ("F32", x.shape) for name, x in numbers.items()}
-
-        def value(name):
-            x = numbers[name] if name in numbers else self.value(name, shapes[name], seed)
-            return bfloat16_bits(x) if dtypes.get(name) == "BF16" else x
-
-        write_stream(folder / "model.safetensors", dict(sorted(listed.items())), value)
-        return sum(map(layout.count, shapes.values()))
+        dtypes = {name: self.dtype if len(shape) > 1 and "pos_grid" not in name else "F32" if shape else "I64" for name, shape in self.shapes().items()}
+        return write(self, dtypes, seed, folder)
 
 
 FRAMES = {"image@-1": (96, 96, "png"), "image": (96, 96, "png")}  # of the published size
