@@ -95,7 +95,7 @@ class Superseded(VlaError):
 
 
 class Late(VlaError):
-    """Server: the request's deadline passed before its turn came, so it was not computed."""
+    """Server: the request's deadline passed before its turn came, or between two tokens of its answer, so it was not computed to its end."""
 
     code = "late"
 

@@ -206,7 +206,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
 
 Status Engine::encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                       EncodedObservation& to) const noexcept try {
-  to.pixels_ahead.reset();
+  to.pixels_ahead.reset(), to.is_late = {};
   VLA_TRY(to.robot, robot(observation.embodiment));
   VLA_CHECK(to.robot->encode(observation, noise, leftover, to));
   return inject_inputs(to.inputs);
@@ -240,19 +240,22 @@ Status Engine::warm_up(const ActShape& act) noexcept try {
   set_inputs(*plan, zeros);
   std::vector<Tap> taps;
   const Solver& solver = of->solver();
-  VLA_CHECK(solve(*plan, solver.decodes ? 1 : solver.n_step, taps));  // of tokens, each costs the same
-  static_cast<void>(plan->x());                                       // waits
+  VLA_CHECK(solve(*plan, solver.decodes ? 1 : solver.n_step, {}, taps));  // of tokens, each costs the same
+  static_cast<void>(plan->x());                                           // waits
   return device_->failure();
 } catch (const std::bad_alloc&) {
   return no_memory();
 }
 
 /// Prefix and at most `most` steps of what was set.
-Status Engine::solve(Plan& plan, int most, std::vector<Tap>& taps) {
+Status Engine::solve(Plan& plan, int most, const std::function<bool()>& is_late, std::vector<Tap>& taps) {
   VLA_CHECK(plan.run_prefix(taps));
   for (int k = 0; k < most; ++k) {
     VLA_TRY(const bool needed, plan.needs_step(k));
     if (!needed) break;
+    if (is_late && is_late())
+      return Error{Code::late, "deadline_ms", "an answer in time", fmt::format("{} of its tokens", k + 1),
+                   "ask less often, or allow more time"};
     VLA_CHECK(plan.run_step(k));
     plan.collect_step_taps(k, taps);
   }
@@ -279,7 +282,7 @@ Result<ActionChunk> Engine::run(EncodedObservation& encoded) {
   if (!in.tokens.empty()) record(taps, "tokens", {static_cast<std::int64_t>(in.tokens.size())}, in.tokens);
   if (!in.state.empty()) record(taps, "state", {static_cast<std::int64_t>(in.state.size())}, in.state);
   clock.lap(timing, "plan");
-  VLA_CHECK(solve(*plan, robot.solver().n_step, taps));
+  VLA_CHECK(solve(*plan, robot.solver().n_step, robot.solver().decodes ? encoded.is_late : nullptr, taps));
   const std::vector<float> x = plan->x();  // other devices than the CPU are waited for here
   VLA_CHECK(device_->failure());
   if (robot.solver().decodes) record(taps, "tokens_out", {static_cast<std::int64_t>(x.size())}, x);

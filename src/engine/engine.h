@@ -138,7 +138,7 @@ class Engine {
   Status make_plans(bool dry);
   Status inject_inputs(Inputs& inputs) const;
   Result<ActionChunk> run(EncodedObservation& encoded);
-  Status solve(Plan& plan, int most, std::vector<Tap>& taps);
+  Status solve(Plan& plan, int most, const std::function<bool()>& is_late, std::vector<Tap>& taps);
   void show(std::vector<Tap>& taps) const;
   template <class T>
   void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,

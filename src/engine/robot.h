@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <functional>
 #include <memory>
 #include <optional>
 #include <string>
@@ -34,6 +35,7 @@ struct EncodedObservation {
   std::optional<Steering> steering;
   Timing timing;
   std::unique_ptr<Device::Sent> pixels_ahead;  // if the pixels are on their way to the device already
+  std::function<bool()> is_late;               // asked before each token: whether nobody wants the answer any more
 };
 
 /// The answer to one observation.

@@ -314,6 +314,8 @@ Status Server::prepare(Act& act) const {
   act.clock.lap(act.answer.stages, "decode");
   const Engine& engine = *act.policy().engine;
   VLA_CHECK(engine.encode(act.request.observation, act.request.noise, act.request.leftover, act.encoded()));
+  if (const auto deadline = act.answer.job.deadline)
+    act.encoded().is_late = [this, until = *deadline] { return loop_.now() >= until; };
   VLA_CHECK(engine.send_ahead(act.encoded()));
   act.clock = {};  // the wait for the device begins
   return {};

@@ -139,8 +139,9 @@ class Brake : public observe::Observer {
 class Running {
  public:
   explicit Running(serve::ServerOptions options = {}, std::vector<observe::Observer*> observers = {},
-                   Brake* brake = nullptr, serve::SeenSizes* sizes = nullptr)
-      : engine(load_engine(kGolden + "/bundle.gguf")), observers_(std::move(observers)), brake_(brake) {
+                   Brake* brake = nullptr, serve::SeenSizes* sizes = nullptr,
+                   const std::string& bundle = kGolden + "/bundle.gguf")
+      : engine(load_engine(bundle)), observers_(std::move(observers)), brake_(brake) {
     if (brake_ != nullptr) observers_.push_back(brake_);
     if (options.bind == serve::ServerOptions().bind) options.bind = {"tcp://127.0.0.1:0"};
     auto opened = serve::Server::open(options);

@@ -110,6 +110,23 @@ TEST_CASE("an act whose deadline passes while it waits is answered late, not com
   CHECK(second.ask(hurried).has_chunk());
 }
 
+TEST_CASE("an answer of tokens is given up between two of them once its deadline has passed") {
+  const GoldenCase fast = GoldenCase::read(golden_path("pi0_fast/two_views"));
+  Brake brake;
+  Running running({}, {}, &brake, nullptr, fast.bundle());
+  Peer peer(running.address());
+  v1::Request hurried = act_request(fast, 1);
+  hurried.mutable_act()->set_deadline_ms(1000);
+  peer.send(hurried);
+  brake.await(1);  // it was taken from the queue in time
+  std::this_thread::sleep_for(std::chrono::milliseconds(1000));
+  brake.let_go(2);
+  const v1::Response late = peer.answer();
+  CHECK(code_of(late) == "LATE");
+  CHECK(late.error().found() == "1 of its tokens");
+  CHECK(peer.ask(act_request(fast, 2)).has_chunk());
+}
+
 TEST_CASE("an act is answered late at its deadline, however long the act before it takes") {
   Held held;
   auto& [brake, running, first] = held;
