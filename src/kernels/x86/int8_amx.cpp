@@ -2,11 +2,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "kernels/int8_loop.h"
 #include "kernels/x86/amx_tiles.h"
+#include "kernels/x86/vnni_rows.h"
 
 namespace vla::kernels {
 namespace {
 
-/// 32 rows by 32 columns: four tiles of sums, two of x and two of the panel.
+/// 32 rows by 32 columns: four tiles of sums, two of x and two of the panel. For few rows, where reading weights is the
+/// bottleneck, VNNI multiplies: a tile takes the time of sixteen rows, and codes smaller than a byte go through memory
+/// on their way to it.
 struct AmxInt8Tile : AmxRounding {
   using Session = AmxSession;
   static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kStep = 768;
@@ -15,9 +18,23 @@ struct AmxInt8Tile : AmxRounding {
   static constexpr bool kEven = false, kBeside = true, kSigned = false;
   static constexpr RoundedLayout kLayout = RoundedLayout::tiles;
 
+  template <class Strips, class Between>
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
+                       std::int32_t* sums, bool add, const Between& between) {
+    if (n_row > Few::kRows) return multiply_tiles(n_row, x, x_stride, strips, depth, sums, add, between);
+    for (std::int64_t k = 0; k < depth; k += kDepth) between();
+    Few::multiply(n_row, x, x_stride, strips, depth, sums, add);
+  }
+
+ private:
+  using Few = VnniRows<2>;
+  static constexpr int kDepth = 64;  // of a tile
+  static constexpr std::size_t kLine = kColumns * sizeof(std::int32_t), kLineOfPair = 2 * Int8Panels::kLine;
+
   template <class Packed, class Between>
-  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2, Packed>& strips,
-                       std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
+  static void multiply_tiles(int n_row, const std::byte* x, std::int64_t x_stride,
+                             const ExpandedStrips<2, Packed>& strips, std::int64_t depth, std::int32_t* sums, bool add,
+                             const Between& between) {
     // Rows after the last of x are multiplied too; their sums are not read.
     KeepVectorUnitPowered vectors;
     open(n_row, sums, add);
@@ -31,8 +48,8 @@ struct AmxInt8Tile : AmxRounding {
 
   /// Multiplies by codes smaller than a byte.
   template <class Strips, class Between>
-  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
-                       std::int32_t* sums, bool add, const Between& between) {
+  static void multiply_tiles(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips,
+                             std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
     alignas(64) std::byte lines[kDepth * kColumns];
     open(n_row, sums, add);
     for (std::int64_t k = 0; k < depth; k += kDepth) {
@@ -45,8 +62,8 @@ struct AmxInt8Tile : AmxRounding {
   }
 
   template <class Between>
-  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const BytePanels::Strips<2>& strips,
-                       std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
+  static void multiply_tiles(int n_row, const std::byte* x, std::int64_t x_stride, const BytePanels::Strips<2>& strips,
+                             std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
     KeepVectorUnitPowered vectors;
     open(n_row, sums, add);
     for (std::int64_t k = 0; k < depth; k += kDepth) {
@@ -56,10 +73,6 @@ struct AmxInt8Tile : AmxRounding {
     }
     close(n_row, sums);
   }
-
- private:
-  static constexpr int kDepth = 64;  // of a tile
-  static constexpr std::size_t kLine = kColumns * sizeof(std::int32_t), kLineOfPair = 2 * Int8Panels::kLine;
 
   static VLA_INLINE void open(int n_row, const std::int32_t* sums, bool add) {
     before_tile_loads();

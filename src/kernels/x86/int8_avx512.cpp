@@ -1,16 +1,17 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include "kernels/int8_loop.h"
-#include "kernels/x86/vec_avx512.h"
+#include "kernels/x86/vnni_rows.h"
 
 namespace vla::kernels {
 namespace {
 
-/// 6 rows by 4 vectors: 24 sums. AVX-512 VNNI's vpdpbusd adds four u8 x s8 products to int32.
+/// 24 sums.
 template <int kDepth>
 struct VnniTile {
   using V = Avx512;
-  static constexpr int kRows = 6, kColumns = 64, kBlockRows = 216, kStep = kDepth;
+  using Rows = VnniRows<4>;
+  static constexpr int kRows = Rows::kRows, kColumns = Rows::kColumns, kBlockRows = 216, kStep = kDepth;
   static constexpr std::int64_t kBlockKiB = 1600;
   static constexpr bool kEven = true, kBeside = false, kSigned = false;
   static constexpr RoundedLayout kLayout = RoundedLayout::none;
@@ -20,50 +21,7 @@ struct VnniTile {
   template <class Strips, class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
                        std::int32_t* sums, bool add, const Between&) {
-    with_height<kRows>(n_row, [&]<int n>() { tile<n>(x, x_stride, strips, depth, sums, add); });
-  }
-
- private:
-  static constexpr int kStrips = kColumns / Int8Panels::kColumns;
-
-  static VLA_INLINE void add_products(__m512i& sum, __m512i numbers, __m512i codes) {
-#ifdef VLA_EMULATED_INSTRUCTIONS  // in plain C++ for tests
-    sum = _mm512_dpbusd_epi32(sum, numbers, codes);
-#else  // from the intrinsic, compilers copy every sum
-    asm("vpdpbusd %2, %1, %0" : "+v"(sum) : "v"(numbers), "v"(codes));
-#endif
-  }
-
-  template <int kCount, class Strips>
-  static void tile(const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
-                   std::int32_t* sums, bool add) {
-    __m512i sum[kCount][kStrips];
-#pragma GCC unroll 6
-    for (int r = 0; r < kCount; ++r)
-#pragma GCC unroll 4
-      for (int j = 0; j < kStrips; ++j)
-        sum[r][j] = add ? _mm512_loadu_si512(sums + r * kColumns + 16 * j) : _mm512_setzero_si512();
-    for (std::int64_t k = 0; k < depth; k += kQuantizedUnit)
-      for (int group = 0; group < kQuantizedUnit / 4; group += 4)
-#pragma GCC unroll 4
-        for (int s = group; s < group + 4; ++s, x += 4) {
-          __m512i numbers[kStrips];
-#pragma GCC unroll 4
-          for (int j = 0; j < kStrips; ++j)
-            numbers[j] = strips.template load<__m512i>(k, s, j, 0), strips.fetch(k, s, j);
-#pragma GCC unroll 6
-          for (int r = 0; r < kCount; ++r) {
-            std::int32_t four;
-            std::memcpy(&four, x + r * x_stride, sizeof(four));
-            const __m512i codes = _mm512_set1_epi32(four);
-#pragma GCC unroll 4
-            for (int j = 0; j < kStrips; ++j) add_products(sum[r][j], numbers[j], codes);
-          }
-        }
-#pragma GCC unroll 6
-    for (int r = 0; r < kCount; ++r)
-#pragma GCC unroll 4
-      for (int j = 0; j < kStrips; ++j) _mm512_storeu_si512(sums + r * kColumns + 16 * j, sum[r][j]);
+    Rows::multiply(n_row, x, x_stride, strips, depth, sums, add);
   }
 };
 
