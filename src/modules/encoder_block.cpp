@@ -15,22 +15,33 @@ Heads heads(int d_model, int n_head, const EncoderFamily& family) {
 
 }  // namespace
 
-EncoderBlock::EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps, EncoderFamily family)
+Film::Film(const Scope& s, int d_condition, int d_model)
+    : scale_(s / "film_scale", d_condition, d_model, Bias::yes),
+      shift_(s / "film_shift", d_condition, d_model, Bias::yes) {}
+
+Tensor Film::operator()(Graph& g, Tensor x, Tensor condition) const {
+  return add(g, multiply(g, x, scale_(g, condition)), shift_(g, condition));
+}
+
+EncoderBlock::EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps, EncoderFamily family,
+                           int d_condition)
     : Module(s),
       attn_norm_(s / "attn_norm", d_model, eps),
       attention_(s, d_model, d_model, heads(d_model, n_head, family)),
       ffn_norm_(s / "ffn_norm", d_model, eps),
       mlp_(s, d_model, d_ff, family.activation, family.rule) {
+  if (d_condition > 0) film_.emplace(s, d_condition, d_model);
   if (!family.scaled) return;
   attn_scale_ = (s / "attn_scale").vector("weight", d_model);
   ffn_scale_ = (s / "ffn_scale").vector("weight", d_model);
 }
 
-Tensor EncoderBlock::forward(Graph& g, Tensor x, Tensor rotary) const {
+Tensor EncoderBlock::forward(Graph& g, Tensor x, Tensor rotary, Tensor condition) const {
   const auto residual = [&](Tensor y, const Param* scale) {
     return scale != nullptr ? gated_add(g, x, y, g.parameter(scale)) : add(g, x, y);
   };
   x = residual(attention_.among(g, attn_norm_(g, x), rotary), attn_scale_);
+  if (film_) x = (*film_)(g, x, condition);
   return residual(mlp_(g, ffn_norm_(g, x)), ffn_scale_);
 }
 

@@ -8,6 +8,15 @@
 #include <numbers>
 
 namespace vla {
+namespace {
+
+std::vector<float> values_of(std::span<const SolverTime> times) {
+  std::vector<float> values;
+  for (const SolverTime& time : times) values.push_back(time.value);
+  return values;
+}
+
+}  // namespace
 
 std::vector<float> sinusoidal_time_embedding(std::span<const float> times, int d, double min_period,
                                              double max_period) {
@@ -32,9 +41,7 @@ TimestepEmbedding::TimestepEmbedding(const Scope& s, int d)
 }
 
 Tensor TimestepEmbedding::operator()(Graph& g, std::span<const SolverTime> times) const {
-  std::vector<float> values;
-  for (const SolverTime& time : times) values.push_back(time.value);
-  return g.constant(sinusoidal_time_embedding(values, d_, min_period_, max_period_),
+  return g.constant(sinusoidal_time_embedding(values_of(times), d_, min_period_, max_period_),
                     {d_, static_cast<std::int64_t>(times.size()), 1, 1});
 }
 
@@ -72,6 +79,10 @@ std::vector<float> wave_embedding(std::span<const float> times, int d, TimeWaves
     if (d % 2 == 1) table.push_back(0.0f);
   }
   return table;
+}
+
+Tensor wave_embedding(Graph& g, std::span<const SolverTime> times, int d, TimeWaves waves) {
+  return g.constant(wave_embedding(values_of(times), d, waves), {d, static_cast<std::int64_t>(times.size()), 1, 1});
 }
 
 }  // namespace vla

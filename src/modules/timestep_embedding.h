@@ -37,7 +37,8 @@ class TimestepEmbedding {
 /// How a reference embeds a time t: cosines or sines first, of n = d/2 float32 angles t * exp(-ln(P) i / m).
 ///   cosines_first  P = 10000, m = n - 1 (diffusers models/embeddings.py get_timestep_embedding, flip_sin_to_cos)
 ///   sines_to_last  P = 10000, m = n - 1, sines first (lerobot policies/diffusion/modeling_diffusion.py
-///                  DiffusionSinusoidalPosEmb)
+///                  DiffusionSinusoidalPosEmb; openvla-oft prismatic/models/action_heads.py
+///                  SinusoidalPositionalEncoding, which rounds exponents as cosines_first: their last bit)
 ///   sines_first    P = 10000, m = n (lerobot policies/groot/groot_n1_7.py SinusoidalPositionalEncoding)
 ///   slow_cosines   P = 100, m = n, cosines first (lerobot policies/xvla/soft_transformer.py timestep_embedding)
 /// The exponents are rounded as each rounds them: at t = 750 an exponent's last bit turns an angle by 5e-5.
@@ -46,5 +47,7 @@ enum class TimeWaves { cosines_first, sines_to_last, sines_first, slow_cosines }
 /// Values of [d, times.size()], one column per time. An odd d ends in a zero; `cosines_first` and `sines_to_last`
 /// take d from 4 on.
 std::vector<float> wave_embedding(std::span<const float> times, int d, TimeWaves waves);
+/// Load rate: the same of the solver's times, [d, times.size()].
+Tensor wave_embedding(Graph& g, std::span<const SolverTime> times, int d, TimeWaves waves);
 
 }  // namespace vla

@@ -8,6 +8,7 @@
 #include "modules/action/mlp_resnet.h"
 #include "modules/language/qwen.h"
 #include "modules/language/view_places.h"
+#include "modules/token_projector.h"
 #include "modules/vision/siglip.h"
 #include "nn/compute_tokens.h"
 #include "nn/tokens.h"
@@ -19,7 +20,8 @@ namespace {
 class BitVla final : public Policy {
   Siglip vision_;  // observation rate
   Qwen lm_;
-  Linear connector_up_, connector_down_, state_in_, state_out_;
+  Linear connector_up_, connector_down_;
+  TokenProjector state_;
   ViewPlaces places_;
   MlpResNet head_;  // step rate
   int n_action_token_, d_row_, stop_token_;
@@ -32,8 +34,7 @@ class BitVla final : public Policy {
         lm_(s / "lm", kBitNet),
         connector_up_(s / "connector_up", vision_.d_model(), lm_.d_model(), Bias::yes),
         connector_down_(s / "connector_down", lm_.d_model(), lm_.d_model(), Bias::yes),
-        state_in_(s / "state_in", s.dim("d_state"), lm_.d_model(), Bias::yes),
-        state_out_(s / "state_out", lm_.d_model(), lm_.d_model(), Bias::yes),
+        state_(s, "state", s.dim("d_state"), lm_.d_model()),
         places_(s, vision_.n_position()),
         head_(s / "head", lm_.d_model() * s.dim("d_action", 1024), lm_.d_model(), s.dim("d_action", 1024)),
         n_action_token_(s.dim("d_action", 1024) * s.dim("horizon", 4096)),
@@ -53,7 +54,7 @@ class BitVla final : public Policy {
     const Tensor image = connector_down_(
         g, activate(g, connector_up_(g, vision_(g, in.images)), Activation::gelu_erf));  // [d_model, n_patch, n_view]
     g.end_stage("vision");
-    const Tensor state = state_out_(g, activate(g, state_in_(g, in.state), Activation::gelu_erf));  // [d_model, 1]
+    const Tensor state = state_(g, in.state);  // [d_model, 1]
     const int n_text = static_cast<int>(in.tokens.dim(0));
     const Tensor prompt = places_.arrange(g, image, n_text, [&](const PromptPiece& piece) {
       if (piece.first != state_place()) return embed(g, in.tokens, piece.first, piece.count);

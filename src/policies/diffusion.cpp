@@ -89,10 +89,7 @@ class Diffusion final : public Policy {
   }
 
   Tensor condition(Graph& g, std::span<const SolverTime> times) const override {
-    std::vector<float> values;
-    for (const SolverTime& time : times) values.push_back(time.value);
-    const Tensor waves = g.constant(wave_embedding(values, unet_.d_time(), TimeWaves::sines_to_last),
-                                    {unet_.d_time(), static_cast<std::int64_t>(times.size()), 1, 1});
+    const Tensor waves = wave_embedding(g, times, unet_.d_time(), TimeWaves::sines_to_last);
     const Tensor time = time_out_(g, activate(g, time_in_(g, waves), Activation::mish));
     return unet_.condition(g, activate(g, time, Activation::mish));
   }

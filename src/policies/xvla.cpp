@@ -99,10 +99,7 @@ class XVla final : public Policy {
   }
 
   Tensor condition(Graph& g, std::span<const SolverTime> times) const override {
-    std::vector<float> values;
-    for (const SolverTime& time : times) values.push_back(time.value);
-    return g.constant(wave_embedding(values, d_time_, TimeWaves::slow_cosines),
-                      {d_time_, static_cast<std::int64_t>(times.size()), 1, 1});
+    return wave_embedding(g, times, d_time_, TimeWaves::slow_cosines);
   }
 
   void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {

@@ -20,6 +20,7 @@ struct QwenFamily {
   Rule rule = Rule::floats;
   bool sub_norms = false;  // RMS norm before both output projections
 };
+constexpr QwenFamily kLlama2 = {Bias::no, false, true};
 constexpr QwenFamily kQwen2 = {Bias::yes, false, true};
 constexpr QwenFamily kQwen3 = {Bias::no, true, true};
 constexpr QwenFamily kQwen3Inner = {Bias::no, true, false};

@@ -10,7 +10,7 @@
 
 namespace vla {
 
-DinoV2::DinoV2(const Scope& s)
+DinoV2::DinoV2(const Scope& s, int d_condition)
     : path_(s.path()),
       d_model_(s.dim("d_model")),
       image_size_(s.dim("image_size", 16384)),
@@ -23,7 +23,8 @@ DinoV2::DinoV2(const Scope& s)
   s.require(d_model_ % n_head == 0, "n_head", fmt::format("a divisor of d_model {}", d_model_), std::to_string(n_head));
   if (n_register_ > 0) registers_.emplace(s / "registers", d_model_, n_register_);
   for (int i = 0; i < n_layer; ++i)
-    blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps", kNormEps), kInternEncoder);
+    blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps", kNormEps), kInternEncoder,
+                         d_condition);
 }
 
 Status DinoV2::check(int width, int height) const {
@@ -32,12 +33,12 @@ Status DinoV2::check(int width, int height) const {
                fmt::format("{} x {}", width, height)};
 }
 
-Tensor DinoV2::operator()(Graph& g, Tensor images) const {
+Tensor DinoV2::operator()(Graph& g, Tensor images, Tensor condition) const {
   const Tensor patches = add(g, patch_embed_(g, images), position_(g, arange(g, n_patch())));
   std::vector<Tensor> tokens = {g.parameter(class_token_)};
   if (registers_) tokens.push_back((*registers_)(g, arange(g, n_register_)));
   Tensor x = prepend_tokens(g, concat_tokens(g, tokens), patches);
-  for (const EncoderBlock& block : blocks_) x = block(g, x);
+  for (const EncoderBlock& block : blocks_) x = block(g, x, Tensor(), condition);
   return slice_tokens(g, x, 1 + n_register_, n_patch());
 }
 

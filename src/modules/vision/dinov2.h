@@ -16,10 +16,12 @@ namespace vla {
 /// VisionTransformer (reg_tokens, no_embed_class), get_intermediate_layers.
 class DinoV2 {
  public:
-  explicit DinoV2(const Scope& s);
+  /// `d_condition`: width of the condition that FiLM modulates the blocks by, 0 without FiLM.
+  explicit DinoV2(const Scope& s, int d_condition = 0);
 
-  /// images [side, side, 3, n_view], standardized -> [d_model, n_patch, n_view]. `check` must have accepted the size.
-  Tensor operator()(Graph& g, Tensor images) const;
+  /// images [side, side, 3, n_view], standardized, condition [d_condition, 1] or none -> [d_model, n_patch, n_view].
+  /// `check` must have accepted the size.
+  Tensor operator()(Graph& g, Tensor images, Tensor condition = {}) const;
   /// Checks that images have the size of the keys. Errors: unsupported.
   Status check(int width, int height) const;
 

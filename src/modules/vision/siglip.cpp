@@ -9,7 +9,7 @@
 
 namespace vla {
 
-Siglip::Siglip(const Scope& s, EncoderFamily family, bool post_norm)
+Siglip::Siglip(const Scope& s, EncoderFamily family, bool post_norm, int d_condition)
     : d_model_(s.dim("d_model")),
       patch_size_(s.dim("patch_size", 256)),
       n_table_(std::max(1, s.dim("image_size", 16384) / patch_size_)),
@@ -19,7 +19,7 @@ Siglip::Siglip(const Scope& s, EncoderFamily family, bool post_norm)
   const int n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff"), n_layer = s.n_layer("n_layer");
   s.require(d_model_ % n_head == 0, "n_head", fmt::format("a divisor of d_model {}", d_model_), std::to_string(n_head));
   for (int i = 0; i < n_layer; ++i)
-    blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps", kNormEps), family);
+    blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps", kNormEps), family, d_condition);
   if (post_norm) post_norm_.emplace(s / "post_norm", d_model_, s.number("norm_eps", kNormEps));
 }
 
@@ -31,13 +31,13 @@ Status Siglip::check(int width, int height) const {
   return ids ? Status() : Status(ids.error());
 }
 
-Tensor Siglip::operator()(Graph& g, Tensor images) const {
+Tensor Siglip::operator()(Graph& g, Tensor images, Tensor condition) const {
   Tensor x = patch_embed_(g, images);
   const Tensor ids = g.constant_ids("vision_position_ids", [&] {
     return *vision_position_ids(position_rule_, static_cast<int>(images.dim(0)) / patch_size_, n_table_);
   });
   x = add(g, x, position_(g, ids));
-  for (const EncoderBlock& block : blocks_) x = block(g, x);
+  for (const EncoderBlock& block : blocks_) x = block(g, x, Tensor(), condition);
   return post_norm_ ? (*post_norm_)(g, x) : x;
 }
 

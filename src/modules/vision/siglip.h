@@ -15,11 +15,13 @@ namespace vla {
 /// SmolVLMVisionTransformer.
 class Siglip {
  public:
-  /// `post_norm`: features are read after a final norm, else after the last layer.
-  explicit Siglip(const Scope& s, EncoderFamily family = kPlainEncoder, bool post_norm = true);
+  /// `post_norm`: features are read after a final norm, else after the last layer. `d_condition`: width of the
+  /// condition that FiLM modulates the blocks by, 0 without FiLM.
+  explicit Siglip(const Scope& s, EncoderFamily family = kPlainEncoder, bool post_norm = true, int d_condition = 0);
 
-  /// images [width, height, 3, n_view] in [-1, 1] -> [d_model, n_patch, n_view]. `check` must have accepted the size.
-  Tensor operator()(Graph& g, Tensor images) const;
+  /// images [width, height, 3, n_view] in [-1, 1], condition [d_condition, 1] or none -> [d_model, n_patch, n_view].
+  /// `check` must have accepted the size.
+  Tensor operator()(Graph& g, Tensor images, Tensor condition = {}) const;
   /// Checks that patches and positions are defined for images of this size. Errors: bad_bundle, unsupported.
   Status check(int width, int height) const;
 
