@@ -22,7 +22,7 @@ import numpy as np
 from .cases import Case, copy_tokenizer
 from .draw import bfloat16, f32
 from .files import bfloat16_bits, write_archive, write_json, write_stream, state_dict
-from .parameters import decoder_layer, linear, norm, parameter, rms_norm, siglip
+from .parameters import decoder_layer, linear, mlp_resnet, parameter, rms_norm, siglip
 from .parameters import statistics as random_statistics
 from .recorder import Taps
 
@@ -55,12 +55,7 @@ class Checkpoint:
             at = f"{LM}layers.{i}."
             model |= decoder_layer(at, d_model, t["intermediate_size"], n_head, t["num_key_value_heads"], d_model // n_head)
             model |= rms_norm(f"{at}self_attn.attn_sub_norm", d_model) | rms_norm(f"{at}mlp.ffn_sub_norm", t["intermediate_size"])
-        d_in = d_model * self.d_action
-        head = norm("model.layer_norm1", d_in) | linear("model.fc1", d_model, d_in)
-        for i in range(2):
-            head |= norm(f"model.mlp_resnet_blocks.{i}.ffn.0", d_model) | linear(f"model.mlp_resnet_blocks.{i}.ffn.1", d_model, d_model)
-        head |= norm("model.layer_norm2", d_model) | linear("model.fc2", self.d_action, d_model)
-        return {"model": model, "action_head": head,
+        return {"model": model, "action_head": mlp_resnet("model.", d_model * self.d_action, d_model, self.d_action),
                 "proprio_projector": linear("fc1", d_model, self.d_state) | linear("fc2", d_model, d_model)}
 
     def value(self, file, name, shape, seed):

@@ -89,6 +89,14 @@ def decoder_layer(at, d, d_ff, n_head, n_kv, d_head, d_kv_in=None, qkv_bias=Fals
     return out | norms(f"{at}input_layernorm", d) | norms(f"{at}post_attention_layernorm", d)
 
 
+def mlp_resnet(at, d_in, d, d_out):
+    """openvla-oft's head of an action; its norms in blocks are called 0."""
+    out = norm(f"{at}layer_norm1", d_in) | linear(f"{at}fc1", d, d_in)
+    for i in range(2):
+        out |= norm(f"{at}mlp_resnet_blocks.{i}.ffn.0", d) | linear(f"{at}mlp_resnet_blocks.{i}.ffn.1", d, d)
+    return out | norm(f"{at}layer_norm2", d) | linear(f"{at}fc2", d_out, d)
+
+
 def siglip(at, d, d_ff, n_layer, patch, n_position):
     """A vision tower of the SigLIP family."""
     out = {f"{at}embeddings.patch_embedding.weight": (d, 3, patch, patch), f"{at}embeddings.patch_embedding.bias": (d,),

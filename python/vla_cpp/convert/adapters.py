@@ -16,7 +16,7 @@ from typing import Dict, Iterator, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
-from .dtypes import WEIGHTS, to_f32
+from .dtypes import WEIGHTS, bf16_to_f32, f32_to_bf16, to_f32
 from .errors import Code, Problems, refuse
 from .files import member, read_json
 from .safetensors_file import CHUNK_BYTES, Entry, read_safetensors
@@ -131,8 +131,8 @@ def read_adapter(folder: str, problems: Problems) -> Adapter:
     return parse(read_json(os.path.join(folder, CONFIG)), read_safetensors(path).entries, problems)
 
 
-def parse(config: dict, entries: Dict[str, Entry], problems: Problems) -> Adapter:
-    """`entries`: an adapter's tensors, by the names in its file."""
+def parse(config: dict, entries: Dict[str, Entry], problems: Problems, in_bf16: bool = False) -> Adapter:
+    """`entries`: an adapter's tensors, by the names in its file. `in_bf16`: they are rounded first."""
     section = _check(config, problems)
     parts: Dict[str, Dict[str, Entry]] = {}  # module -> what is behind its name
     replaced: Dict[str, Entry] = {}
@@ -147,7 +147,7 @@ def parse(config: dict, entries: Dict[str, Entry], problems: Problems) -> Adapte
             replaced[own] = entry._replace(name=own)
     factors: Dict[str, Factors] = {}
     for module, tensors in sorted(parts.items()):
-        factors.update(_factors(module, tensors, section, problems))
+        factors.update(_factors(module, tensors, section, problems, in_bf16))
     return Adapter(factors, replaced)
 
 
@@ -192,7 +192,7 @@ def _matches(regex: str, module: str, section: Section) -> bool:
         return False
 
 
-def _factors(module: str, tensors: Dict[str, Entry], section: Section, problems: Problems) -> Dict[str, Factors]:
+def _factors(module: str, tensors: Dict[str, Entry], section: Section, problems: Problems, in_bf16: bool) -> Dict[str, Factors]:
     """Of a linear layer, a convolution or an embedding."""
     where = "adapter of " + module
     if "magnitude_vector" in tensors:
@@ -213,18 +213,20 @@ def _factors(module: str, tensors: Dict[str, Entry], section: Section, problems:
     if up.shape[1] != rank or any(size != 1 for size in up.shape[2:]) or rank > MAX_RANK:
         problems.add(where, "lora_B of {} columns".format(rank), str(up.shape))
         return {}
-    scale, a, b = _scale(module, rank, section), _whole(down), _whole(up)
+    scale, a, b = _scale(module, rank, section), _whole(down, in_bf16), _whole(up, in_bf16)
     left, right = (a.T, b.T) if names[0].startswith("embedding") else (b, a)
     made = {module + ".weight": Factors(scale * left, right)}
     if bias is not None:
-        made[module + ".bias"] = Factors(scale * _whole(bias).reshape(-1, 1), np.ones((1, 1)))
+        made[module + ".bias"] = Factors(scale * _whole(bias, in_bf16).reshape(-1, 1), np.ones((1, 1)))
     return made
 
 
-def _whole(entry: Entry) -> np.ndarray:
+def _whole(entry: Entry, in_bf16: bool) -> np.ndarray:
     """In float64, as a matrix."""
-    values = np.concatenate([to_f32(raw, entry.dtype) for raw in entry.chunks()]).astype(np.float64)
-    return values.reshape(entry.shape[0], -1)
+    values = np.concatenate([to_f32(raw, entry.dtype) for raw in entry.chunks()])
+    if in_bf16:
+        values = bf16_to_f32(f32_to_bf16(values))
+    return values.astype(np.float64).reshape(entry.shape[0], -1)
 
 
 def merge(tensors: Dict[str, Entry], adapter: Optional[Adapter], notes: List[str], problems: Problems) -> None:

@@ -25,20 +25,14 @@ from ...checkpoint import Checkpoint, Layout, Tensors, read_stored
 from ...errors import Problems, refuse
 from ...features import robot_keys, view_name, views_of
 from ...files import member, read_json, read_text
-from ...options import Option, stats, views
+from ...options import stats, views
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan, read_tokenizer
-from ...torch_file import read_torch
-from .. import Options, Plan
+from .. import Options, Plan, oft
 from .mapping import HEAD, PROPRIO, Sizes, dropped, network_keys, read_sizes, weights
 
-STATISTICS, PROCESSOR, IMAGES = "dataset_statistics.json", "processor_config.json", "preprocessor_config.json"
-# What the trainer writes beside the language model, each with the step in its name.
-SIDECARS = ("action_head", "proprio_projector")
+PROCESSOR, IMAGES = "processor_config.json", "preprocessor_config.json"
 HORIZONS = {(8, 7): 8}  # of LIBERO, by numbers of states and actions
-GRIPPER = 6  # from 0, closed, to 1, open; LIBERO's simulator opens it by -1
-CROP, EPS, JPEG_QUALITY = 0.9, 1e-8, 95
-VIEWS, ALIASES = ("image", "image2"), ("full_image", "wrist_image")  # LeRobot's names of LIBERO's cameras, and the reference's
 BOS, STOP, END, IMAGE, STATE = "<|begin_of_text|>", "<|end_of_text|>", "<|eot_id|>", "<|image_pad|>", "<proprio_pad>"
 QUESTION = "What action should the robot take to {instruction}?"
 # What convert_ckpt.py puts behind the system's sentence: one message of a user, and the start of the assistant's.
@@ -61,7 +55,7 @@ PROCESSOR_IGNORED = {"processor_class", "num_additional_image_tokens", "vision_f
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     s = read_sizes(checkpoint.config, problems)
-    views = list(options.views) or list(VIEWS)
+    views = list(options.views) or list(oft.VIEWS)
     s.max_views = len(views)
     _read_robot(checkpoint, s, problems)
     problems.raise_any()
@@ -70,20 +64,12 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     tokenizer = read_tokenizer(checkpoint.folder, s.lm.n_vocab, problems, checkpoint.notes)
     problems.raise_any()  # a prompt takes a sound tokenizer
     text, prompt_keys = _prompt(checkpoint, tokenizer, s, problems)
-    normal = {"kind": "openpi_quantiles", "eps": EPS}  # the same formula, on statistics in float64
+    kind = "openpi_quantiles"  # the same formula, on statistics in float64
     document = {
         "image": image_ops(s.vision.image_size, options.plain_images),
         "text": text,
-        "state": [
-            {"op": "normalize", "stats": "stats." + recipe.STATE, **normal},
-            {"op": "clip", "low": -1.0, "high": 1.0},
-            {"op": "pad", "size": s.d_state},
-        ],
-        "action": [
-            {"op": "unnormalize", "stats": "stats." + recipe.ACTION, **normal, "columns": [i for i, on in enumerate(mask) if on]},
-            {"op": "affine", "columns": [GRIPPER], "scale": -2.0, "shift": 1.0},
-            {"op": "sign", "columns": [GRIPPER]},
-        ],
+        "state": oft.state_ops(kind, s.d_state),
+        "action": oft.action_ops(kind, mask, True),
     }
     keys = [
         *network_keys(s),
@@ -97,38 +83,15 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def image_ops(side: int, plain: bool) -> List[dict]:
-    """From the camera's image, turned by 180 degrees as LIBERO's clients do. The reference passes it through a JPEG first
-    (openvla_utils.py, resize_image_for_policy), as the data were that it was trained on; `plain`: not that."""
-    size = {"width": side, "height": side}
     half = [0.5] * 3
-    return [
-        *([] if plain else [{"op": "jpeg", "quality": JPEG_QUALITY}]),
-        {"op": "lanczos3", **size},
-        {"op": "crop_and_resize", "area": CROP, **size},
-        {"op": "size", **size},
-        {"op": "standardize", "mean": half, "std": half, "arithmetic": "float32_then_bfloat16"},
-    ]
+    return [*oft.image_ops(side, plain), {"op": "standardize", "mean": half, "std": half, "arithmetic": "float32_then_bfloat16"}]
 
 
 def _read_tensors(folder: str, problems: Problems) -> Tensors:
-    """The language model's, and those of both files under their file's name, without what DistributedDataParallel puts in front."""
-    tensors, aliases = read_stored(folder, problems)
-    steps = {}
-    for part in SIDECARS:
-        pattern = re.compile(re.escape(part) + r"--(.+)_checkpoint\.pt")
-        found = {name: match[1] for name in sorted(os.listdir(folder)) for match in [pattern.fullmatch(name)] if match}
-        if len(found) != 1:
-            hint = "the reference loads the only one" if found else "download it beside config.json"
-            problems.add("{}--STEP_checkpoint.pt".format(part), "one such file", ", ".join(found) or "none", hint)
-            continue
-        ((name, steps[part]),) = found.items()
-        for stored, entry in read_torch(os.path.join(folder, name), "").items():
-            own = "{}.{}".format(part, stored[len("module.") :] if stored.startswith("module.") else stored)
-            tensors[own] = entry._replace(name=own)
-    if len(set(steps.values())) > 1:
-        (head, proprio), where = (steps[part] for part in SIDECARS), "{}--{}_checkpoint.pt".format
-        problems.add(where(SIDECARS[1], proprio), "the step of " + where(SIDECARS[0], head), proprio, "give the files of one step")
-    return tensors, aliases
+    """The language model's, and those of both files beside it."""
+    tensors = read_stored(folder, problems)
+    oft.read_parts(folder, tensors, ("action_head", "proprio_projector"), (), problems)
+    return tensors
 
 
 LAYOUT = Layout(
@@ -136,7 +99,7 @@ LAYOUT = Layout(
     (
         stats("the entry of dataset_statistics.json to normalize with, where there are several"),
         views("names of the cameras, in the order of the prompt's view slots"),
-        Option("--plain-images", "images do not go through a JPEG of quality 95, as they do in the authors' evaluation", default=False),
+        oft.PLAIN_IMAGES,
     ),
     model_types=("bitvla", "openvla"),
     read=_read_tensors,
@@ -144,14 +107,8 @@ LAYOUT = Layout(
 
 
 def _read_robot(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> None:
-    def dim(name: str, axis: int) -> int:
-        entry = checkpoint.tensors.get(name)
-        if entry is None or len(entry.shape) != 2:
-            problems.add("tensor " + name, "a matrix", "none" if entry is None else str(entry.shape))
-            return 0
-        return entry.shape[axis]
-
-    s.d_state, s.d_action = dim(PROPRIO + "fc1.weight", 1), dim(HEAD + "fc2.weight", 0)
+    s.d_state = oft.dim(checkpoint, PROPRIO + "fc1.weight", 1, problems)
+    s.d_action = oft.dim(checkpoint, HEAD + "fc2.weight", 0, problems)
     s.horizon = HORIZONS.get((s.d_state, s.d_action), 0)
     if s.d_state and s.d_action and not s.horizon:
         problems.unsupported(
@@ -164,32 +121,20 @@ def _read_robot(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> None:
 
 def _statistics(checkpoint: Checkpoint, name: str, s: Sizes, problems: Problems) -> Tuple[Dict[str, np.ndarray], List[bool]]:
     """In float64, as the reference reads them, and which columns of an action are normalized."""
-    everything = read_json(checkpoint.path(STATISTICS))
+    everything = read_json(checkpoint.path(oft.STATISTICS))
     if name not in everything and (name or len(everything) != 1):
         hint = "--stats NAME, the data set that the policy was tuned on"
-        raise refuse(STATISTICS, "one of " + ", ".join(everything), name or "several", hint)
+        raise refuse(oft.STATISTICS, "one of " + ", ".join(everything), name or "several", hint)
     name = name or next(iter(everything))
-    where = "{}: {}".format(STATISTICS, name)
-    stated = member(everything, name, dict, STATISTICS)
-    tensors: Dict[str, np.ndarray] = {}
-    for feature, key, width in ((recipe.STATE, "proprio", s.d_state), (recipe.ACTION, "action", s.d_action)):
-        group = member(stated, key, dict, where)
-        for quantile in ("q01", "q99"):
-            values = group.get(quantile)
-            sound = isinstance(values, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
-            numbers = np.asarray(values if sound else [], np.float64)
-            if numbers.shape != (width,) or not np.isfinite(numbers).all():
-                problems.add("{}.{}.{}".format(where, key, quantile), "{} finite numbers".format(width), str(values)[:80])
-            tensors["stats.{}.{}".format(feature, quantile)] = numbers
-    mask = member(stated, "action", dict, where).get("mask")
-    if not isinstance(mask, list) or len(mask) != s.d_action or not all(isinstance(on, bool) for on in mask):
+    where = "{}: {}".format(oft.STATISTICS, name)
+    stated = member(everything, name, dict, oft.STATISTICS)
+    widths = {recipe.STATE: s.d_state, recipe.ACTION: s.d_action}
+    tensors, mask = oft.ranges(stated, where, widths, ("q01", "q99"), problems)
+    if "mask" not in member(stated, "action", dict, where):
         hint = "without it the reference would stretch the gripper as well"
-        problems.add(where + ".action.mask", "true or false for {} numbers".format(s.d_action), str(mask)[:80], hint)
-        mask = [True] * s.d_action
-    elif mask[GRIPPER]:
-        problems.unsupported(where + ".action.mask", "false for the gripper, number {}".format(GRIPPER), "true")
-    if member(stated, "proprio", dict, where).get("mask", [True] * s.d_state) != [True] * s.d_state:
-        problems.unsupported(where + ".proprio.mask", "true for all numbers", str(stated["proprio"]["mask"])[:80])
+        problems.add(where + ".action.mask", "true or false for {} numbers".format(s.d_action), "None", hint)
+    elif mask[oft.GRIPPER] and stated["action"]["mask"] == mask:
+        problems.unsupported(where + ".action.mask", "false for the gripper, number {}".format(oft.GRIPPER), "true")
     return tensors, mask
 
 
@@ -255,6 +200,6 @@ def _prompt(checkpoint: Checkpoint, tokenizer: TokenizerPlan, s: Sizes, problems
 
 def _features(views: List[str], options: Options, notes: List[str], s: Sizes, problems: Problems) -> List[Key]:
     names = [view_name(view) for view in views]
-    aliases = [view_name(alias) for alias in ALIASES] if tuple(views) == VIEWS else [""] * len(views)
+    aliases = [view_name(alias) for alias in oft.ALIASES] if tuple(views) == oft.VIEWS else [""] * len(views)
     keys, dims = views_of(names, aliases, [0] * len(views), len(views)), {recipe.STATE: s.d_state, recipe.ACTION: s.d_action}
     return robot_keys(keys, dims, options.dataset_info, notes, problems)

@@ -15,7 +15,7 @@ from typing import List
 from ...bundle import Key
 from ...errors import Problems
 from ...files import member
-from ...layers import BITNET, Rows, linear, norm, ternary
+from ...layers import BITNET, Rows, linear, ternary
 from ...networks import (
     NORM_EPS,
     Language,
@@ -31,10 +31,9 @@ from ...networks import (
     siglip,
 )
 from ...section import Fixed, Section
-from .. import Dropped
+from .. import Dropped, oft
 
 WHERE = "config.json"
-N_HEAD_LAYER = 2  # a literal of the action head
 VISION = defaults(768, 3072, 12, 12, image_size=224, patch_size=16, layer_norm_eps=1e-6, vision_use_head=True)
 # Towers of other numbers are plain ones: to the reference, an absent key means 32 bits.
 VISION_FIXED: Fixed = {
@@ -130,40 +129,29 @@ def network_keys(s: Sizes) -> List[Key]:
             "policy": pick(s, "d_state d_action horizon max_views stop_token"),
             "vision": {**vars(s.vision), "position_rule": "row_major"},
             "lm": s.lm,
-            "head": dict(n_layer=N_HEAD_LAYER, norm_eps=NORM_EPS),
+            "head": dict(n_layer=oft.N_HEAD_LAYER, norm_eps=NORM_EPS),
             "solver": dict(steps=1, kind="direct", noise="none"),
         }
     )
 
 
-TOWER, LM, HEAD, PROPRIO = "vision_tower.vision_model.", "language_model.model.", "action_head.model.", "proprio_projector."
+TOWER, LM, HEAD, PROPRIO = "vision_tower.vision_model.", "language_model.model.", oft.HEAD + "model.", oft.PROPRIO
 
 
 def weights(s: Sizes) -> Rows:
-    """The proprio projector and the head are trained and stored in float32."""
     source, d = "multi_modal_projector.linear_", s.lm.d_model
-    state = linear("state_in", PROPRIO + "fc1", d, s.d_state) + linear("state_out", PROPRIO + "fc2", d, d)
     return [
         *_vision(s.vision),
         *linear("connector_up", source + "1", d, s.vision.d_model),
         *linear("connector_down", source + "2", d, d),
-        *(row._replace(in_bf16=True) for row in state),
+        *oft.projector("state", PROPRIO, d, s.d_state),
         *decoder(s.lm, LM, BITNET),
-        *(row._replace(in_bf16=True) for row in _head(s)),
+        *oft.head(HEAD, d, s.d_action),
     ]
 
 
 def _vision(v: Vision) -> Rows:
     return siglip(TOWER, v, product=ternary, post_norm=False)
-
-
-def _head(s: Sizes) -> Rows:
-    d, d_in = s.lm.d_model, s.d_action * s.lm.d_model
-    rows = norm("head.in_norm", HEAD + "layer_norm1", d_in) + linear("head.in", HEAD + "fc1", d, d_in)
-    for i in range(N_HEAD_LAYER):
-        target, block = "head.blk.{}.".format(i), "{}mlp_resnet_blocks.{}.ffn.".format(HEAD, i)
-        rows += norm(target + "norm", block + "0", d) + linear(target + "linear", block + "1", d, d)
-    return rows + norm("head.out_norm", HEAD + "layer_norm2", d) + linear("head.out", HEAD + "fc2", s.d_action, d)
 
 
 def dropped(s: Sizes) -> List[Dropped]:
