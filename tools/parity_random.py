@@ -34,8 +34,8 @@ from pathlib import Path
 
 import numpy as np
 from goldens import (
-    act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, groot, openvla, pi, pi0_fast, recorder, rtc, smolvla, turbovla, turbovla_authors,
-    vla_jepa, xvla)
+    act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, groot, openvla, openvla_oft, pi, pi0_fast, recorder, rtc, smolvla, turbovla,
+    turbovla_authors, vla_jepa, xvla)
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -294,6 +294,29 @@ def draw_openvla(seed):
     return openvla.case(seed, frame, r.choice((*TEXTS, "", "Pick UP the <s> cube</s> \u2581", "<PAD>")), checkpoint, **({"stats": "bridge_orig"} if others else {}))
 
 
+def draw_openvla_oft(seed):
+    """The same for OpenVLA-OFT: OpenVLA's sizes, cameras, platforms and others, states, FiLM with LoRA, diffusion, files of one process and of several."""
+    r = random.Random(f"openvla_oft {seed}")
+    kv, d_head = r.choice((1, 2, 3)), r.choice((4, 6, 8, 16))
+    heads = kv * r.choice((1, 2, 3))
+    towers = [openvla.Tower(16 * r.choice((1, 2, 3, 4)), r.randint(2, 4), r.randint(10, 70)) for _ in range(2)]
+    text = openvla.decoder(heads * d_head, r.randint(1, 4), heads, kv, r.choice((20, 36, 50)), rms_norm_eps=r.choice((1e-6, 1e-5)),
+                           rope_theta=r.choice((10000.0, 500.0)))
+    platform = r.choice((*openvla_oft.PLATFORMS, *(f"{r.randint(1, 12)},{norm}" for norm in ("bounds", "bounds_q99"))))
+    known = {"libero": (7, 8), "aloha": (14, 14), "bridge": (7, 7)}
+    d_action, d_state = known.get(platform, (r.randint(1, 9), r.randint(1, 9)))
+    side, views, plain = 14 * r.choice((1, 2, 2, 3)), [f"cam{i}" for i in range(r.randint(1, 3))], platform != "aloha" and r.random() < 0.3
+    train = r.choice((50, 50, 7, 100))
+    checkpoint = openvla_oft.Checkpoint(
+        *towers, text, side, d_action, n_shard=r.choice((1, 3)), other_stats=r.choice(((), ("other",))),
+        unmasked=r.choice((None, (), (d_action - 1,), tuple(i for i in range(d_action) if r.random() < 0.4))), d_state=r.choice((d_state, d_state, 0)),
+        platform=platform, rank=r.choice((0, 0, 4, 20, 32)), steps=r.choice(((), (), (train, r.randint(1, min(train, 5))))), prefix=r.choice(("", "module.")))
+    frames = {view: (side, side, "png") if plain else (r.randint(10, 90), r.randint(10, 90), r.choice(("png", "png", "jpg"))) for view in views}
+    options = {"plain_images": True} if plain else {}
+    return openvla_oft.case(seed, frames, r.choice((*TEXTS, "", "Pick UP the <s> cube</s> \u2581", "<PAD>")), checkpoint,
+                            **options, **({"stats": openvla_oft.STATISTICS} if checkpoint.other_stats else {}))
+
+
 def draw_vla_jepa(seed):
     """The same for VLA-JEPA: prompts, tokens, cameras, steps of the pipeline; in one of ten an instruction that the backbone takes an image for."""
     r = random.Random(f"vla_jepa {seed}")
@@ -538,7 +561,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"{what} {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "openvla": draw_openvla, "pi0_fast": draw_pi0_fast, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "openvla": draw_openvla, "openvla_oft": draw_openvla_oft, "pi0_fast": draw_pi0_fast, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs} | {
     f"groot_{release}": functools.partial(draw_groot, release) for release in groot.DRAWN}

@@ -110,9 +110,17 @@ def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
         "diffusion/ddim": {n for n in declared if n.startswith("vision.")} | encoder_with_batch_norms("vision.#"),
         "diffusion/environment": {n for n in declared if n.startswith(("unet.down", "unet.up"))},
         "diffusion/no_cameras": {n for n in declared if n.startswith("vision.")},
-        "vla_jepa/camera": {f"state_{layer}.{kind}" for layer in ("in", "out") for kind in ("weight", "bias")},
+        "openvla_oft/film": two_layers("state", "dino.blk.#.film", "siglip.blk.#.film"),
+        "openvla_oft/diffusion": two_layers("noise"),
+        "vla_jepa/camera": two_layers("state"),
     }
     assert without_numbers(bundle) == declared ^ other.get(name, set())
+
+
+def two_layers(*paths):
+    """Names of projections to a token, and of the factor and the shift of FiLM."""
+    parts = {"film": ("scale", "shift")}
+    return {f"{at}_{layer}.{kind}" for at in paths for layer in parts.get(at.split(".")[-1], ("in", "out")) for kind in ("weight", "bias")}
 
 
 def encoder_with_batch_norms(at):

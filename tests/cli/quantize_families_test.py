@@ -36,6 +36,7 @@ WIDE = {
     "groot/n1_5": {"base": replace(all_cases()["groot/n1_5"].checkpoint.base, vision=gr00t_n1_5.vision(D, 3, 3, FF, 28),
                                    text=gr00t_n1_5.text(D, 5, 3, 1, 64, FF), head=gr00t.head(3, (6, 3, 64), (2, 3, 64), D, 14, 11, 6))},
     "openvla/bridge": {"dino": openvla.Tower(D, 2, FF), "siglip": openvla.Tower(D, 2, FF), "text": openvla.decoder(D, 2, 3, 1, FF)},
+    "openvla_oft/libero": {"dino": openvla.Tower(D, 2, FF), "siglip": openvla.Tower(D, 2, FF), "text": openvla.decoder(D, 3, 3, 1, FF)},
     "pi0/two_views": PI,
     "pi05/two_views": PI,
     "pi0_fast/two_views": {"vision": pi.tower(D, 2, 3, FF), "lm": GEMMA, "rows": {}},

@@ -201,13 +201,6 @@ def test_what_is_not_understood_is_refused_by_name(converter, changes, part, cod
     assert part in str(error) and code in {problem.code for problem in error.problems}
 
 
-def test_the_head_of_another_policy_beside_it_is_refused(converter):
-    converter.save(saved())
-    (converter.folder / "action_head--150000_checkpoint.pt").write_bytes(b"")
-    error = converter.refusal()
-    assert "OpenVLA-OFT" in str(error) and error.code == Code.UNSUPPORTED
-
-
 def test_there_is_one_camera(converter):
     assert "one camera" in str(converter.refusal(saved(), views=["a", "b"]))
     keys = converter.bundle(views=["top"]).keys

@@ -52,11 +52,13 @@ TEST_CASE("a range of zero is replaced by eps in both directions") {
   CHECK(mapped(norm_rule("quantiles"), Direction::unnormalize, 0.5f, 3.0f, 3.0f, 1.0f) == 3.5f);
 }
 
-TEST_CASE("openpi's kinds add eps in both directions") {
+TEST_CASE("kinds of openpi and of OpenVLA-OFT add eps in both directions") {
   CHECK(mapped(norm_rule("openpi_mean_std"), Direction::normalize, 0.5, 1.0f, 1.5f, 3.0f) == 1.0f);
   CHECK(mapped(norm_rule("openpi_mean_std"), Direction::unnormalize, 0.5, 1.0f, 1.5f, 3.0f) == 7.0f);
   CHECK(mapped(norm_rule("openpi_quantiles"), Direction::normalize, 0.5, 3.0f, 3.0f, 3.25f) == 0.0f);
   CHECK(mapped(norm_rule("openpi_quantiles"), Direction::unnormalize, 0.5, 3.0f, 3.0f, 0.0f) == 3.25f);
+  CHECK(mapped(norm_rule("openvla_bounds"), Direction::normalize, 0.5, 3.0f, 3.0f, 3.25f) == 0.0f);
+  CHECK(mapped(norm_rule("openvla_bounds"), Direction::unnormalize, 0.5, 3.0f, 3.0f, 0.0f) == 3.25f);
 }
 
 TEST_CASE("evo1's kinds add eps in both directions") {

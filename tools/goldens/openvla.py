@@ -192,14 +192,14 @@ CASES = {
 # --- the reference --------------------------------------------------------------------------------------------------
 
 
-def open_reference():
+def open_reference(variable=REFERENCE, repository="openvla/openvla", empty=("tensorflow",)):
     """Puts the reference on the path; packages whose __init__ imports what trains a policy get an empty one.  Returns the module of its evaluation."""
-    if REFERENCE not in os.environ:
-        raise SystemExit(f"error: {REFERENCE} is not set: give it the folder of a checkout of https://github.com/openvla/openvla")
-    root = Path(os.environ[REFERENCE])
+    if variable not in os.environ:
+        raise SystemExit(f"error: {variable} is not set: give it the folder of a checkout of https://github.com/{repository}")
+    root = Path(os.environ[variable])
     if "experiments.robot.openvla_utils" not in sys.modules:
         sys.path.insert(0, str(root))
-        for name in ("prismatic", "prismatic.extern", "prismatic.extern.hf", "tensorflow"):
+        for name in ("prismatic", "prismatic.extern", "prismatic.extern.hf", *empty):
             sys.modules[name] = package = types.ModuleType(name)
             package.__spec__ = importlib.machinery.ModuleSpec(name, None, is_package=True)
             package.__path__ = [str(root / name.replace(".", "/"))]
@@ -237,26 +237,34 @@ def narrow(create, shapes):
     return made
 
 
+def opened(checkpoint, kind):
+    """As their get_vla opens a checkpoint."""
+    from prismatic.extern.hf import modeling_prismatic
+
+    create, timm = modeling_prismatic.timm.create_model, modeling_prismatic.timm
+    timm.create_model = narrow(create, sizes_of(checkpoint))
+    try:
+        model, info = modeling_prismatic.OpenVLAForActionPrediction.from_pretrained(
+            checkpoint, torch_dtype=kind, attn_implementation="sdpa", output_loading_info=True)
+    finally:
+        timm.create_model = create
+    assert not info["missing_keys"] and not info["unexpected_keys"], info
+    if (checkpoint / "dataset_statistics.json").is_file():
+        model.norm_stats = json.loads((checkpoint / "dataset_statistics.json").read_text())
+    return model
+
+
 class Reference:
     def __init__(self, checkpoint, dtype):
         import torch
 
         utils = open_reference()
-        from prismatic.extern.hf import modeling_prismatic, processing_prismatic
+        from prismatic.extern.hf import processing_prismatic
         from prismatic.extern.hf.configuration_prismatic import OpenVLAConfig
 
         kind = torch.float32 if dtype == "float32" else torch.bfloat16
-        create, timm = modeling_prismatic.timm.create_model, modeling_prismatic.timm
         utils.AutoImageProcessor.register(OpenVLAConfig, processing_prismatic.PrismaticImageProcessor, exist_ok=True)
-        timm.create_model = narrow(create, sizes_of(checkpoint))
-        try:
-            model, info = modeling_prismatic.OpenVLAForActionPrediction.from_pretrained(
-                checkpoint, torch_dtype=kind, attn_implementation="sdpa", output_loading_info=True)
-        finally:
-            timm.create_model = create
-        assert not info["missing_keys"] and not info["unexpected_keys"], info
-        if (checkpoint / "dataset_statistics.json").is_file():  # as their get_vla does
-            model.norm_stats = json.loads((checkpoint / "dataset_statistics.json").read_text())
+        model = opened(checkpoint, kind)
         self.model, self.processor = model.eval(), processing_prismatic.PrismaticProcessor.from_pretrained(checkpoint)
         utils.torch = types.SimpleNamespace(bfloat16=kind)  # to which they round pixels
         self.utils, self.images = utils, processing_prismatic.TVF

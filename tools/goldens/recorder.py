@@ -96,7 +96,7 @@ def config_type(checkpoint) -> str:
     if not (Path(checkpoint) / "config.json").is_file():
         return next(arch for arch, layout in authors().items() if not layout.has_config and layout.tells(str(checkpoint)))
     config = json.loads((Path(checkpoint) / "config.json").read_text())
-    return config.get("type") or of_model_type(config, authors()) or "evo1"
+    return config.get("type") or of_model_type(config, str(checkpoint), authors()) or "evo1"
 
 
 def described(checkpoint) -> str:
@@ -245,7 +245,7 @@ class ChunkRecorder(Taps):
 
 def network_order(name):
     """Sort key: inputs, vision, prefix, language layers with keys and values before their output, steps, result."""
-    stages = ("pixels", "tokens", "state", "position_ids", "vision", "dino", "siglip", "deepstack", "connector", "connector_down", "projector", "prefix", "encoder", "lm",
+    stages = ("pixels", "tokens", "state", "position_ids", "vision", "dino", "siglip", "deepstack", "connector", "connector_down", "projector", "projector_down", "prefix", "encoder", "lm",
               "vl", "vlm_in", "aux_in", "state_in", "state_out", "expert", "head", "dit", "logits", "step", "tokens_out", "chunk")
     parts = name.split(".")
     stage = stages.index(parts[0]) if parts[0] in stages else len(stages)
@@ -291,7 +291,7 @@ def read_taps(file):
 
 # Cases of which every tap is kept: one of each family, and all of BitVLA, whose parts are compared on the reference's own inputs.
 EVERY_TAP = {"act/pre_norm", "bitvla/micro", "bitvla/one_view", "bitvla/two_layers", "diffusion/ddim", "evo1/two_views", "gr00t_n1_5/percentiles",
-             "gr00t_n1_6/aspect", "gr00t_n1_7/percentiles", "openvla/bridge", "pi0/absent_view", "pi05/long_text", "pi0_fast/stops", "smolvla/long_text",
+             "gr00t_n1_6/aspect", "gr00t_n1_7/percentiles", "openvla/bridge", "openvla_oft/libero", "pi0/absent_view", "pi05/long_text", "pi0_fast/stops", "smolvla/long_text",
              "turbovla/long_text", "turbovla_authors/two_views", "vla_jepa/three_views", "xvla/two_arms"}
 
 

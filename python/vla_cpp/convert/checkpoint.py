@@ -115,7 +115,7 @@ class Layout(NamedTuple):
     options: Tuple[Option, ...]  # what such a checkpoint leaves open, of what others state or do not have
     model_types: Tuple[str, ...] = ()  # what config.json states as model_type
     keys: Tuple[str, ...] = ()  # of config.json, any of which tells it from others with its model_type
-    files: Tuple[str, ...] = ()  # any of them tells it, where config.json does not; names or patterns
+    files: Tuple[str, ...] = ()  # any of them tells it, where config.json does not, or names several; names or patterns
     read: Callable[[str, Problems], Tensors] = read_stored  # tensors of the folder, and those that share the memory of one
     about: str = ""  # a paragraph of `vla-convert --help`
     has_config: bool = True  # whether there is a config.json
@@ -260,17 +260,19 @@ def without_prefix(tensors: Dict[str, Entry], aliases: Dict[str, str], layout: s
     return {name[n:]: entry._replace(name=name[n:]) for name, entry in tensors.items()}, {k[n:]: v[n:] for k, v in aliases.items()}
 
 
-def of_model_type(config: dict, authors: Mapping[str, Layout]) -> str:
-    """The architecture that config.json's model_type names, of several the one whose keys it has; empty where it names none."""
+def of_model_type(config: dict, folder: str, authors: Mapping[str, Layout]) -> str:
+    """The architecture that config.json's model_type names, of several one whose keys it has, of these the one whose files the folder has;
+    empty where it names none."""
     found = [arch for arch, layout in authors.items() if config.get("model_type") in layout.model_types]
-    return next((arch for arch in found if any(key in config for key in authors[arch].keys)), "".join(found[:1]))
+    own = [arch for arch in found if any(key in config for key in authors[arch].keys)]
+    return next((arch for arch in own if authors[arch].tells(folder)), "".join((own or found)[:1]))
 
 
 def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, Layout]) -> str:
     """LeRobot's config states a type and features, and none of the others does."""
     if "type" in config or "input_features" in config:
         return LEROBOT
-    stated = of_model_type(config, authors)
+    stated = of_model_type(config, folder, authors)
     if stated:
         return stated
     for arch, layout in authors.items():

@@ -30,6 +30,7 @@ constexpr NormRule kRules[] = {
     {"quantile10", "q10", "q90", Spread::range, Eps::replaces_zero, float32, false},
     {"openpi_mean_std", "mean", "std", Spread::value, Eps::added, float64, false},
     {"openpi_quantiles", "q01", "q99", Spread::range, Eps::added, float64, false},
+    {"openvla_bounds", "min", "max", Spread::range, Eps::added, float64, false},
     {"evo1_mean_std", "mean", "std", Spread::value, Eps::added, float32, false},
     {"evo1_min_max", "min", "max", Spread::range, Eps::added, float32, false},
     {"evo1_quantiles", "q01", "q99", Spread::range, Eps::added, float32, false},

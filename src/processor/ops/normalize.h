@@ -38,7 +38,8 @@ struct NormRule {
 };
 
 /// The rules of all kinds, in the order of their sources: lerobot processor/normalize_processor.py (_apply_transform);
-/// openpi transforms.py (Normalize, Unnormalize); Evo-1 scripts/Evo1_server.py (Normalizer); Isaac-GR00T
+/// openpi transforms.py (Normalize, Unnormalize); openvla-oft experiments/robot/openvla_utils.py (normalize_proprio)
+/// and modeling_prismatic.py (_unnormalize_actions); Evo-1 scripts/Evo1_server.py (Normalizer); Isaac-GR00T
 /// gr00t/data/utils.py, and gr00t/data/transform/state_action.py (Normalizer) for N1.5.
 std::span<const NormRule> norm_rules();
 /// The rule of a kind that exists.

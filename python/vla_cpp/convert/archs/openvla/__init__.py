@@ -10,7 +10,6 @@ Reference: openvla prismatic/extern/hf (modeling_prismatic.py, processing_prisma
 
 from __future__ import annotations
 
-import glob
 import os
 from typing import Dict, List, Tuple
 
@@ -19,7 +18,7 @@ import numpy as np
 from ... import recipe
 from ...ascii_bpe import check_undivided
 from ...bundle import Key
-from ...checkpoint import Checkpoint, Layout, Tensors, read_stored
+from ...checkpoint import Checkpoint, Layout
 from ...errors import Problems, refuse
 from ...features import robot_keys, view_name, views_of
 from ...files import member, read_json
@@ -59,10 +58,10 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     statistics, mask = _statistics(checkpoint, options.stats, problems)
     s.d_action = len(mask)
     _check_generation(checkpoint, s, problems)
-    pixels = _read_pixels(checkpoint, s.dino.image_size, problems)
+    pixels = read_pixels(checkpoint, s.dino.image_size, problems)
     tokenizer = read_tokenizer(checkpoint.folder, s.lm.n_vocab, problems, checkpoint.notes)
     problems.raise_any()
-    empty = _check_prompt(checkpoint, tokenizer, s, problems)
+    empty = check_prompt(checkpoint, tokenizer, s, problems)
     chosen = list(options.views) or [VIEW]
     if len(chosen) != 1:
         problems.unsupported("--views", "one camera", ",".join(chosen), "the network reads one image")
@@ -81,11 +80,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 def _recipe(side: int, mask: List[bool]) -> Dict[str, List[dict]]:
     return {
         "image": [{"op": "resize", "width": side, "height": side, "filter": "pillow_bicubic"}],
-        "text": [
-            {"op": "lower"},
-            {"op": "template", "text": QUESTION + "{instruction}" + ANSWER},
-            {"op": "tokenize", "max_tokens": MAX_TOKENS, "truncate": "right"},
-        ],
+        "text": text_ops(),
         "state": [],
         "action": [
             {
@@ -99,12 +94,12 @@ def _recipe(side: int, mask: List[bool]) -> Dict[str, List[dict]]:
     }
 
 
-def _read_tensors(folder: str, problems: Problems) -> Tensors:
-    sidecars = sorted(map(os.path.basename, glob.glob(os.path.join(glob.escape(folder), "*--*_checkpoint.pt"))))
-    if sidecars:
-        hint = "OpenVLA-OFT has the same config.json and another head, which is not supported yet"
-        problems.unsupported(sidecars[0], "a policy that answers with tokens", "a head of its own", hint)
-    return read_stored(folder, problems)
+def text_ops() -> List[dict]:
+    return [
+        {"op": "lower"},
+        {"op": "template", "text": QUESTION + "{instruction}" + ANSWER},
+        {"op": "tokenize", "max_tokens": MAX_TOKENS, "truncate": "right"},
+    ]
 
 
 LAYOUT = Layout(
@@ -112,12 +107,11 @@ LAYOUT = Layout(
     (stats("the data set whose statistics un-normalize actions (their unnorm_key), where there are several"), views("name of the camera")),
     model_types=("openvla",),
     keys=("timm_model_ids", "vision_backbone_id"),
-    read=_read_tensors,
 )
 
 
-def _statistics(checkpoint: Checkpoint, name: str, problems: Problems) -> Tuple[Dict[str, np.ndarray], List[bool]]:
-    """In float64, as the reference reads them, and which numbers of an action are un-normalized."""
+def chosen_statistics(checkpoint: Checkpoint, name: str) -> Tuple[dict, str]:
+    """Of a data set, and where they stand: a fine-tune's own file, otherwise config.json. Errors: bad_bundle."""
     own = os.path.exists(checkpoint.path(STATISTICS))
     everything = read_json(checkpoint.path(STATISTICS)) if own else member(checkpoint.config, "norm_stats", dict, WHERE)
     where = STATISTICS if own else WHERE + ": norm_stats"
@@ -125,8 +119,14 @@ def _statistics(checkpoint: Checkpoint, name: str, problems: Problems) -> Tuple[
         hint = "--stats NAME, the data set of the robot that the policy is to move"
         raise refuse(where, "one of " + (", ".join(everything) or "several data sets"), name or str(len(everything)), hint)
     name = name or next(iter(everything))
-    where = "{}: {}.action".format(where, name)
-    stated = member(member(everything, name, dict, where), "action", dict, where)
+    return member(everything, name, dict, where), "{}: {}".format(where, name)
+
+
+def _statistics(checkpoint: Checkpoint, name: str, problems: Problems) -> Tuple[Dict[str, np.ndarray], List[bool]]:
+    """In float64, as the reference reads them, and which numbers of an action are un-normalized."""
+    entry, where = chosen_statistics(checkpoint, name)
+    stated = member(entry, "action", dict, where)
+    where += ".action"
     out = {}
     for quantile in ("q01", "q99"):
         values = stated.get(quantile)
@@ -151,7 +151,7 @@ def _check_generation(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> N
     s.stop_token = section.count("eos_token_id", 0, s.lm.n_vocab - 1)
 
 
-def _read_pixels(checkpoint: Checkpoint, side: int, problems: Problems) -> List[Dict[str, tuple]]:
+def read_pixels(checkpoint: Checkpoint, side: int, problems: Problems) -> List[Dict[str, tuple]]:
     """By tower what is subtracted from pixels, and what they are divided by: in float32, as torchvision does."""
     images = Section(IMAGES, read_json(checkpoint.path(IMAGES)), {}, problems)
     images.check_fixed(IMAGES_FIXED)
@@ -201,7 +201,7 @@ def _channels(images: Section, key: str, i: int, above: float) -> List[float]:
     return [1.0] * 3
 
 
-def _check_prompt(checkpoint: Checkpoint, tokenizer: TokenizerPlan, s: Sizes, problems: Problems) -> int:
+def check_prompt(checkpoint: Checkpoint, tokenizer: TokenizerPlan, s: Sizes, problems: Problems) -> int:
     """That one token stands in front of a prompt, and the image behind it. Returns the empty token's id."""
     config, keys = read_json(checkpoint.path(TOKENIZER)), {key.name: key.value for key in tokenizer.keys}
     if config.get("add_prefix_space") is not None:

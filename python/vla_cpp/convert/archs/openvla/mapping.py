@@ -21,7 +21,7 @@ from ...checkpoint import Checkpoint
 from ...errors import Problems
 from ...files import member
 from ...layers import Names, Rows, blocks, linear, norm, table, vector
-from ...networks import Language, Vision, check_heads, decoder, defaults, keys_of, pick, read_language
+from ...networks import Fields, Language, Vision, check_heads, decoder, defaults, keys_of, pick, read_language
 from ...section import Fixed, Section
 from ...standardized import Standardized
 from .. import MATRIX, VECTOR, Dropped, Weight
@@ -144,13 +144,17 @@ def _tower(checkpoint: Checkpoint, at: str, side: int, problems: Problems) -> Vi
     return Vision(d, max(depth - 1, 1), N_HEAD, d_ff, side, PATCH, NORM_EPS)
 
 
+def module_keys(s: Sizes) -> Dict[str, Fields]:
+    """Of the towers and the language model."""
+    dino, siglip = {**vars(s.dino), "n_register": s.n_register}, {**vars(s.siglip), "position_rule": "row_major"}
+    return {"dino": dino, "siglip": siglip, "lm": s.lm}
+
+
 def network_keys(s: Sizes) -> List[Key]:
     return keys_of(
         {
             "policy": pick(s, "d_state d_action horizon"),
-            "dino": {**vars(s.dino), "n_register": s.n_register},
-            "siglip": {**vars(s.siglip), "position_rule": "row_major"},
-            "lm": s.lm,
+            **module_keys(s),
             "solver": dict(kind="greedy", steps=s.d_action, noise="none", stop_token=s.stop_token),
             "action_tokens": dict(kind="bins", n_bin=s.n_bin, first_id=s.first_id),
         }
@@ -159,6 +163,11 @@ def network_keys(s: Sizes) -> List[Key]:
 
 def weights(s: Sizes, pixels: Tuple[Dict[str, tuple], Dict[str, tuple]]) -> Rows:
     """`pixels`: mean and std of what each tower reads."""
+    return [*image_weights(s, pixels), *decoder(s.lm, LM), *linear("lm.head", HEAD, s.lm.n_vocab, s.lm.d_model, bias=False)]
+
+
+def image_weights(s: Sizes, pixels: Tuple[Dict[str, tuple], Dict[str, tuple]]) -> Rows:
+    """Towers and projector."""
     dino, siglip, d = s.dino, s.siglip, s.lm.d_model
     d_patch = dino.d_model + siglip.d_model
     return [
@@ -173,8 +182,6 @@ def weights(s: Sizes, pixels: Tuple[Dict[str, tuple], Dict[str, tuple]]) -> Rows
         *linear("projector_up", PROJECTOR + "fc1", 4 * d_patch, d_patch),
         *linear("projector_mid", PROJECTOR + "fc2", d, 4 * d_patch),
         *linear("projector_down", PROJECTOR + "fc3", d, d),
-        *decoder(s.lm, LM),
-        *linear("lm.head", HEAD, s.lm.n_vocab, d, bias=False),
     ]
 
 
