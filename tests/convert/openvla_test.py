@@ -77,6 +77,15 @@ def test_the_stored_weights_read_pixels_from_0_to_1(converter):
     assert bundle.dtypes["dino.blk.0.attn_q.weight"] == "bf16"
 
 
+def test_stated_results_replace_the_means_they_would_be_made_from(converter):
+    plain = converter.bundle(Saved(), stats="bridge_orig").tensors["dino.patch_embed.bias"]
+    other = {"means": [[0.25] * 3] * 2}
+    stated = converter.bundle(Saved(preprocessor_config=lambda c: c.update(other)), stats="bridge_orig")
+    assert (stated.tensors["dino.patch_embed.bias"] == plain).all()
+    made = converter.bundle(Saved(preprocessor_config=lambda c: (c.update(other), c.pop("tvf_normalize_params"))), stats="bridge_orig")
+    assert (made.tensors["dino.patch_embed.bias"] != plain).any()
+
+
 def test_q_k_and_v_are_thirds_of_one_matrix(converter):
     tensors = converter.bundle(saved(), dtype="f32").tensors
     name = openvla.SIGLIP + "blocks.1.attn.qkv.weight"
@@ -183,7 +192,8 @@ REFUSED = [
     (images(input_sizes=[[3, 224, 224]] * 2), "input_sizes", Code.UNSUPPORTED),
     (images(means=[[0.5] * 3]), "means", Code.BAD_BUNDLE),
     (images(stds=[[0.5] * 3, [0.5, 0.5, 0.0]]), "stds", Code.BAD_BUNDLE),
-    (images(means=[[0.5] * 3] * 2), "tvf_normalize_params", Code.UNSUPPORTED),
+    (images(tvf_normalize_params=[{"mean": [0.5] * 3}] * 2), "tvf_normalize_params", Code.UNSUPPORTED),
+    (images(tvf_normalize_params=[{"mean": [0.5] * 3, "std": [0.5] * 2}] * 2), "tvf_normalize_params: stds", Code.BAD_BUNDLE),
     (images(tvf_do_letterbox=True), "tvf_do_letterbox", Code.UNSUPPORTED),
     (images(tvf_resize_params=[]), "tvf_resize_params", Code.UNSUPPORTED),
     (images(new_key=1), "new_key", Code.UNSUPPORTED),

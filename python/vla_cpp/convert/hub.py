@@ -30,6 +30,7 @@ HUB_PATTERNS = [
     "*.safetensors",
     "mp_rank_00_model_states.pt",
     "*_checkpoint.pt",
+    "*--checkpoint.pt",
     "tokenizer/*",
     "action_tokenizer/*",
     "vlm/*.json",

@@ -36,8 +36,8 @@ def read_parts(folder: str, tensors: Tensors, required: Sequence[str], optional:
     """Adds those of a file of each part, under its name, without what DistributedDataParallel puts in front."""
     steps: Dict[str, str] = {}
     for part in (*required, *optional):
-        pattern = re.compile(re.escape(part) + r"--(.+)_checkpoint\.pt")
-        found = {name: match[1] for name in sorted(os.listdir(folder)) for match in [pattern.fullmatch(name)] if match}
+        pattern = re.compile(re.escape(part) + r"--(?:(.+)_)?checkpoint\.pt")  # on the hub also without a step
+        found = {name: match[1] or "" for name in sorted(os.listdir(folder)) for match in [pattern.fullmatch(name)] if match}
         if not found and part in optional:
             continue
         if len(found) != 1:

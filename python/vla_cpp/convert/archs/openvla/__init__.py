@@ -39,7 +39,8 @@ QUESTION, ANSWER = "In: What action should the robot take to ", "?\nOut:"
 EMPTY, EMPTY_ID = "\u2581", 29871  # behind every prompt: a blank that no word follows, with its id in Llama 2's vocabulary
 MAX_TOKENS = 256  # of a prompt, far above any instruction: the reference cuts none
 # What their functions of images are made from, where a file states the results as well.
-DERIVED = {"tvf_resize_params", "tvf_crop_params", "tvf_normalize_params", "tvf_do_letterbox", "tvf_letterbox_fill"}
+NORMALIZE = "tvf_normalize_params"
+DERIVED = {"tvf_resize_params", "tvf_crop_params", NORMALIZE, "tvf_do_letterbox", "tvf_letterbox_fill"}
 IMAGES_IGNORED = {"auto_map", "image_processor_type", "processor_class", "feature_extractor_type"}
 IMAGES_FIXED: Fixed = {
     "use_fused_vision_backbone": (False, True),
@@ -152,16 +153,14 @@ def _check_generation(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> N
 
 
 def read_pixels(checkpoint: Checkpoint, side: int, problems: Problems) -> List[Dict[str, tuple]]:
-    """By tower what is subtracted from pixels, and what they are divided by: in float32, as torchvision does."""
+    """By tower what is subtracted from pixels, and what they are divided by: in float32, as torchvision does. What the file states of the
+    results replaces what they would be made from (transformers ImageProcessingMixin.__init__), as in VLA-Adapter's files."""
     images = Section(IMAGES, read_json(checkpoint.path(IMAGES)), {}, problems)
     images.check_fixed(IMAGES_FIXED)
     images.refuse_unknown({*IMAGES_FIXED, *IMAGES_IGNORED, *DERIVED, "input_sizes", "means", "stds"})
     if images.get("input_sizes") != [[3, side, side]] * 2:
         images.bad("input_sizes", "twice 3 x {0} x {0}, as config.json: image_sizes has it".format(side), unsupported=True)
-    out = []
-    for i in range(2):
-        numbers = {"mean": _channels(images, "means", i, -1e3), "std": _channels(images, "stds", i, 1e-3)}
-        out.append({key: tuple(map(float, np.float32(values))) for key, values in numbers.items()})
+    out = [_standard(images, i) for i in range(2)]
     resize = {"antialias": True, "interpolation": 3, "max_size": None, "size": [side, side]}
     derived = {
         "tvf_resize_params": [resize] * 2,
@@ -172,19 +171,23 @@ def read_pixels(checkpoint: Checkpoint, side: int, problems: Problems) -> List[D
     for key, value in derived.items():
         if images.values.get(key, value) != value:
             images.bad(key, "{}, as the file's other keys make it".format(value), unsupported=True)
-    stated = images.values.get("tvf_normalize_params", [{}, {}])
-    for i, numbers in enumerate(out):
-        own = stated[i] if isinstance(stated, list) and len(stated) == 2 else None
-        if not isinstance(own, dict) or any(not _equal(own[key], numbers.get(key)) for key in own if key != "inplace"):
-            images.bad("tvf_normalize_params", "the numbers of means and stds", str(stated)[:120], unsupported=True)
-            break
-    return out
+    if NORMALIZE not in images.values:
+        return out
+    stated = images.values[NORMALIZE]
+    if (
+        not isinstance(stated, list)
+        or len(stated) != 2
+        or not all(isinstance(own, dict) and {*own, "inplace"} == {"inplace", "mean", "std"} for own in stated)
+    ):
+        images.bad(NORMALIZE, "mean and std of two towers", str(stated)[:120], unsupported=True)
+        return out
+    rows = {key + "s": [own[key] for own in stated] for key in ("mean", "std")}
+    return [_standard(Section("{}: {}".format(IMAGES, NORMALIZE), rows, {}, problems), i) for i in range(2)]
 
 
-def _equal(stated, numbers) -> bool:
-    return isinstance(stated, list) and [np.float32(x) if isinstance(x, (int, float)) else None for x in stated] == list(
-        np.float32(numbers or ())
-    )
+def _standard(images: Section, i: int) -> Dict[str, tuple]:
+    numbers = {"mean": _channels(images, "means", i, -1e3), "std": _channels(images, "stds", i, 1e-3)}
+    return {key: tuple(map(float, np.float32(values))) for key, values in numbers.items()}
 
 
 def _channels(images: Section, key: str, i: int, above: float) -> List[float]:

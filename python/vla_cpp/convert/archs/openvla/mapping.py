@@ -96,7 +96,15 @@ def read_sizes(checkpoint: Checkpoint, problems: Problems) -> Sizes:
         top.bad("n_action_bins", expected)
     section = text if top.get("eos_token_id") is None else top
     s.stop_token = section.count("eos_token_id", 0, s.lm.n_vocab - 1)
-    sides = config.get("image_sizes")
+    read_towers(checkpoint, s, top)
+    return s
+
+
+def read_towers(checkpoint: Checkpoint, s, top: Section) -> None:
+    """Sets dino, siglip and n_register of `s`."""
+    ids, sides = top.get("timm_model_ids"), top.get("image_sizes")
+    if not isinstance(ids, list) or len(ids) != 2 or ids[0] != DINO_ID or ids[1] not in SIGLIP_IDS:
+        top.bad("timm_model_ids", "{}, and {}".format(DINO_ID, " or ".join(SIGLIP_IDS)), unsupported=True)
     if (
         not isinstance(sides, list)
         or len(sides) != 2
@@ -106,22 +114,19 @@ def read_sizes(checkpoint: Checkpoint, problems: Problems) -> Sizes:
         or sides[0] % PATCH
     ):
         top.bad("image_sizes", "the same multiple of {} for both towers".format(PATCH), unsupported=True)
-        return s
-    s.dino = _tower(checkpoint, DINO, sides[0], problems)
-    s.siglip = _tower(checkpoint, SIGLIP, sides[0], problems)
-    s.n_register = _dim(checkpoint, DINO + "reg_token", 3, 1, problems)
-    return s
+        return
+    s.dino = _tower(checkpoint, DINO, sides[0], top.problems)
+    s.siglip = _tower(checkpoint, SIGLIP, sides[0], top.problems)
+    s.n_register = _dim(checkpoint, DINO + "reg_token", 3, 1, top.problems)
 
 
 def _check_backbones(top: Section) -> None:
-    language, ids = top.get("llm_backbone_id"), top.get("timm_model_ids")
+    language = top.get("llm_backbone_id")
     if isinstance(language, str) and language.startswith("vicuna"):
         hint = "openvla-v01 has another prompt and one tower; fine-tunes of openvla-7b are supported"
         top.bad("llm_backbone_id", " or ".join(BACKBONES), hint=hint, unsupported=True)
     elif language not in BACKBONES:
         top.bad("llm_backbone_id", " or ".join(BACKBONES), unsupported=True)
-    if not isinstance(ids, list) or len(ids) != 2 or ids[0] != DINO_ID or ids[1] not in SIGLIP_IDS:
-        top.bad("timm_model_ids", "{}, and {}".format(DINO_ID, " or ".join(SIGLIP_IDS)), unsupported=True)
 
 
 def _dim(checkpoint: Checkpoint, name: str, rank: int, axis: int, problems: Problems) -> int:
@@ -194,7 +199,7 @@ def _patch_embed(target: str, source: str, v: Vision, pixels: Dict[str, tuple]) 
     ]
 
 
-def dropped(s: Sizes) -> List[Dropped]:
+def dropped(s) -> List[Dropped]:
     """What stands behind the block whose patches are read."""
     out = []
     for at, v, names in ((DINO, s.dino, DINO_BLOCK), (SIGLIP, s.siglip, SIGLIP_BLOCK)):
