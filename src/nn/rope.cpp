@@ -9,6 +9,9 @@
 #include <numbers>
 #include <numeric>
 
+#include "base/bf16.h"
+#include "nn/tokens.h"
+
 namespace vla {
 namespace {
 
@@ -23,17 +26,19 @@ Tensor make_table(Graph& g, float base, RotaryAngle rule, const std::vector<Pair
                   const std::vector<PositionId>& positions) {
   std::string key = fmt::format("rope/{}/{}/{}", base, static_cast<int>(rule), fmt::join(positions, "/"));
   for (const Pair& pair : pairs) key += fmt::format("/{}:{}", pair.axis, pair.exponent);
+  const auto rounded = [&](float x) { return rule == RotaryAngle::bfloat16 ? from_bf16(to_bf16(x)) : x; };
   const auto angle = [&](const PositionId& id, const Pair& pair) {
     const float position = static_cast<float>(id[static_cast<std::size_t>(pair.axis)]);
     const float period = static_cast<float>(std::pow(double{base}, double{pair.exponent}));
-    return double{rule == RotaryAngle::quotient ? position / period : position * (1.0f / period)};
+    if (rule == RotaryAngle::quotient) return double{position / period};
+    return double{rounded(rounded(position) * rounded(1.0f / period))};
   };
   const auto d_head = static_cast<std::int64_t>(2 * pairs.size()), n = static_cast<std::int64_t>(positions.size());
   return g.constant(key, {d_head, n, 1, 1}, [&] {
     std::vector<float> table;
     for (const PositionId& id : positions) {
-      for (const Pair& pair : pairs) table.push_back(static_cast<float>(std::cos(angle(id, pair))));
-      for (const Pair& pair : pairs) table.push_back(static_cast<float>(std::sin(angle(id, pair))));
+      for (const Pair& pair : pairs) table.push_back(rounded(static_cast<float>(std::cos(angle(id, pair)))));
+      for (const Pair& pair : pairs) table.push_back(rounded(static_cast<float>(std::sin(angle(id, pair)))));
     }
     return table;
   });
@@ -45,6 +50,23 @@ Tensor apply_rope(Graph& g, Tensor x, float base, RotaryAngle angle, int first) 
   std::vector<int> positions(static_cast<std::size_t>(x.dim(2)));
   std::iota(positions.begin(), positions.end(), first);
   return apply_rope(g, x, rotary_table(g, static_cast<int>(x.dim(0)), base, angle, positions));
+}
+
+Tensor apply_uneven_rope(Graph& g, Tensor x, float base) {
+  const auto half = static_cast<int>(x.dim(0) / 2);
+  const Tensor pairs = reshape(g, x, {2, half, x.dim(1), x.dim(2)});
+  const Tensor halves = reshape(g, permute(g, pairs, {1, 0, 2, 3}), {x.dim(0), x.dim(1), x.dim(2), 1});
+  std::vector<PositionId> ids;
+  for (int i = 0; i < x.dim(2); ++i) ids.push_back({i, 0, 0});
+  std::vector<Tensor> parts;
+  for (const int which : {0, 1}) {  // the first of each pair, the second
+    std::vector<Pair> angles;
+    for (int i = 0; i < half; ++i)
+      angles.push_back({0, static_cast<float>(2 * ((2 * i + which) % half)) / static_cast<float>(2 * half)});
+    const Tensor turned = apply_rope(g, halves, make_table(g, base, RotaryAngle::bfloat16, angles, ids));
+    parts.push_back(slice_features(g, turned, which * half, half));
+  }
+  return concat(g, parts, 0);
 }
 
 Tensor rotary_table(Graph& g, int d_head, float base, RotaryAngle angle, std::span<const int> positions) {

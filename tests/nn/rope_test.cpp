@@ -7,6 +7,7 @@
 #include <cmath>
 #include <numbers>
 
+#include "base/bf16.h"
 #include "kernels/kernel_set.h"
 #include "support/graph_runner.h"
 
@@ -60,6 +61,28 @@ TEST_CASE("rope turns half-split pairs, which differs from interleaved ones, for
             interleaved_difference, std::abs(y[even] - (x[even] * std::cos(angle) - x[even + 1] * std::sin(angle))));
       }
   CHECK(interleaved_difference > 0.1);
+}
+
+TEST_CASE(
+    "neighbours turn by angles of a half-split rope in bfloat16, each by its own, and the first of all come first") {
+  constexpr int kHeads = 2, kTokens = 3;
+  for (const int d_head : {6, 8}) {
+    const std::vector<float> x = ramp(static_cast<std::size_t>(d_head * kHeads * kTokens), 1);
+    const auto y = run_graph([&](Graph& g) {
+      return apply_uneven_rope(g, test::constant(g, x, {d_head, kHeads, kTokens}), 100.0f);
+    });
+    REQUIRE(y.size() == x.size());
+    for (int row = 0; row < kHeads * kTokens; ++row)
+      for (int j = 0; j < d_head; ++j) {
+        const auto rounded = [](double number) { return double{from_bf16(to_bf16(static_cast<float>(number)))}; };
+        const double turn = rounded(row / kHeads * rounded(std::pow(100.0, -2.0 * (j % (d_head / 2)) / d_head)));
+        const auto at = [&](int i) { return double{x[static_cast<std::size_t>(row * d_head + i)]}; };
+        const double other = j % 2 == 0 ? -at(j + 1) : at(j - 1);
+        const int placed = j / 2 + (j % 2 == 0 ? 0 : d_head / 2);
+        CHECK(std::abs(y[static_cast<std::size_t>(row * d_head + placed)] -
+                       (at(j) * rounded(std::cos(turn)) + other * rounded(std::sin(turn)))) <= 4e-6);
+      }
+  }
 }
 
 TEST_CASE("rotary angles are rounded as either reference rounds them, which differs at large positions") {
