@@ -57,6 +57,15 @@ Tensor Qwen::operator()(Graph& g, Tensor x) const {
   return (*this)(g, x, positions, causal_mask(g, 0, static_cast<int>(positions.size())));
 }
 
+void Qwen::layers(Graph& g, Tensor x, const std::function<void(int, Tensor)>& each) const {
+  const int n = static_cast<int>(x.dim(1));
+  const Tensor rotary = heads_.rotary(g, 0, n), mask = causal_mask(g, 0, n);
+  for (int i = 0; i < n_layer(); ++i) {
+    x = blocks_[static_cast<std::size_t>(i)](g, x, rotary, mask);
+    each(i, norm_ && i + 1 == n_layer() ? (*norm_)(g, x) : x);
+  }
+}
+
 Tensor Qwen::operator()(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const {
   return (*this)(g, x, rotary_table(g, heads_.d_head, heads_.rope_base, heads_.rope_angle, positions), mask, {});
 }

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <functional>
 #include <optional>
 #include <span>
 #include <vector>
@@ -57,6 +58,9 @@ class Qwen {
   Tensor embed(Graph& g, Tensor tokens, Tensor views, const ViewPlaces& places) const;
   /// x [d_model, n] at positions 0 to n - 1, causal -> features [d_model, n].
   Tensor operator()(Graph& g, Tensor x) const;
+  /// The same, layer by layer: `each` gets the number of a layer, from 0, and what it returns, the last one behind the
+  /// final norm if there is one. Source: transformers modeling_qwen2.py Qwen2Model.forward (all_hidden_states).
+  void layers(Graph& g, Tensor x, const std::function<void(int, Tensor)>& each) const;
   /// The same for given positions and mask [n, n].
   Tensor operator()(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const;
   /// The same with full attention.
