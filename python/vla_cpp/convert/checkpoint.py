@@ -115,6 +115,7 @@ class Layout(NamedTuple):
     options: Tuple[Option, ...]  # what such a checkpoint leaves open, of what others state or do not have
     model_types: Tuple[str, ...] = ()  # what config.json states as model_type
     keys: Tuple[str, ...] = ()  # of config.json, any of which tells it from others with its model_type
+    value: Tuple[str, Tuple[str, ...]] = ("", ())  # a key of config.json and its values, any of which tells it from all others
     files: Tuple[str, ...] = ()  # any of them tells it, where config.json does not, or names several; names or patterns
     read: Callable[[str, Problems], Tensors] = read_stored  # tensors of the folder, and those that share the memory of one
     about: str = ""  # a paragraph of `vla-convert --help`
@@ -261,11 +262,12 @@ def without_prefix(tensors: Dict[str, Entry], aliases: Dict[str, str], layout: s
 
 
 def of_model_type(config: dict, folder: str, authors: Mapping[str, Layout]) -> str:
-    """The architecture that config.json's model_type names, of several one whose keys it has, of these the one whose files the folder has;
-    empty where it names none."""
+    """The architecture that config.json's model_type names, of several the one whose value it has, otherwise one whose keys it has, of these
+    the one whose files the folder has; empty where it names none."""
     found = [arch for arch, layout in authors.items() if config.get("model_type") in layout.model_types]
+    told = [arch for arch in found if config.get(authors[arch].value[0]) in authors[arch].value[1]]
     own = [arch for arch in found if any(key in config for key in authors[arch].keys)]
-    return next((arch for arch in own if authors[arch].tells(folder)), "".join((own or found)[:1]))
+    return "".join(told[:1]) or next((arch for arch in own if authors[arch].tells(folder)), "".join((own or found)[:1]))
 
 
 def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, Layout]) -> str:
