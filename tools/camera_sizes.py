@@ -7,8 +7,8 @@
 
 The policies are those of the golden cases (`python tools/goldens make`), the references theirs: an environment with torch and lerobot, and
 for the runtime a build whose libvla.so VLA_LIBRARY names. Cameras of one observation have one size half of the time, and each its own
-otherwise. A reference that fails has refused: then the runtime has to refuse as well. `turbovla_authors`, `openvla` and `openvla_oft` need
-environments of their own (their modules in tools/goldens), and --only.
+otherwise. A reference that fails has refused: then the runtime has to refuse as well. `turbovla_authors`, `openvla`, `openvla_oft` and
+`vla_adapter` need environments of their own (their modules in tools/goldens), and --only.
 """
 
 import argparse
@@ -119,7 +119,7 @@ def stated_sizes(case):
 def cases(only):
     """One of each family and of each way in which its pipeline may go: those of GR00T keep aspects or pad."""
     chosen = [name for name in all_cases() if name.split("/")[1] in
-              ("two_views", "pre_norm", "lerobot", "modes", "libero", "aspect", "relative", "four_by_three", "camera", "small", "no_state", "ddpm", "ddim", "environment", "bridge", "aloha",
+              ("two_views", "pre_norm", "lerobot", "modes", "libero", "aspect", "relative", "four_by_three", "camera", "small", "no_state", "ddpm", "ddim", "environment", "bridge", "aloha", "calvin",
                "n1_5", "n1_7")]
     return [name for name in chosen if wanted(name, only)]
 
@@ -127,7 +127,7 @@ def cases(only):
 def wanted(name, only):
     """Without --only all families that run in this environment."""
     family = name.split("/")[0]
-    return only in (family, name) if only else family not in ("turbovla_authors", "openvla", "openvla_oft") and name != "groot/n1_5"
+    return only in (family, name) if only else family not in ("turbovla_authors", "openvla", "openvla_oft", "vla_adapter") and name != "groot/n1_5"
 
 
 def check(name, count, seed):

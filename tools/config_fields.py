@@ -27,7 +27,7 @@ from goldens.turbovla_authors import WEIGHTS
 from tokenizer_fields import changed, changes
 
 CASES = ("act/two_views", "smolvla/two_views", "pi0/two_views", "pi05/two_views", "xvla/two_views", "turbovla/two_views", "turbovla_authors/two_views",
-         "vla_jepa/libero", "evo1/two_views", "evo1/lerobot", "diffusion/ddpm", "diffusion/ddim", "diffusion/no_cameras", "openvla/bridge", "openvla/fine_tuned", "openvla_oft/libero", "openvla_oft/diffusion", "pi0_fast/stops", "gr00t_n1_5/modes", "gr00t_n1_6/relative", "gr00t_n1_7/libero",
+         "vla_jepa/libero", "evo1/two_views", "evo1/lerobot", "diffusion/ddpm", "diffusion/ddim", "diffusion/no_cameras", "openvla/bridge", "openvla/fine_tuned", "openvla_oft/libero", "openvla_oft/diffusion", "vla_adapter/one_view", "vla_adapter/calvin", "pi0_fast/stops", "gr00t_n1_5/modes", "gr00t_n1_6/relative", "gr00t_n1_7/libero",
          "groot/n1_5", "groot/n1_7")
 SKIPPED = ("data_config", "tokenizer", "vocab", "model.safetensors.index", "dims", "special_tokens", "added_tokens")
 

@@ -20,7 +20,7 @@ from camera_sizes import ROOT, Pair, wanted
 RECORDED = ROOT / "tests/golden/empty_instructions.json"
 CASES = ("act/two_views", "diffusion/ddim", "evo1/two_views", "evo1/lerobot", "gr00t_n1_5/libero", "gr00t_n1_6/libero", "gr00t_n1_7/libero", "gr00t_n1_7/clean_text",
          "groot/n1_5", "groot/n1_7", "openvla/bridge", "openvla_oft/film", "pi0/two_views", "pi05/two_views", "pi0_fast/two_views", "smolvla/two_views", "turbovla/two_views",
-         "turbovla/no_state", "turbovla_authors/two_views", "vla_jepa/libero",
+         "turbovla/no_state", "turbovla_authors/two_views", "vla_adapter/calvin", "vla_jepa/libero",
          "xvla/two_views")
 
 

@@ -35,7 +35,7 @@ from pathlib import Path
 import numpy as np
 from goldens import (
     act, bitvla, cases, diffusion, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, groot, openvla, openvla_oft, pi, pi0_fast, recorder, rtc, smolvla, turbovla,
-    turbovla_authors, vla_jepa, xvla)
+    turbovla_authors, vla_adapter, vla_jepa, xvla)
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -317,6 +317,27 @@ def draw_openvla_oft(seed):
                             **options, **({"stats": openvla_oft.STATISTICS} if checkpoint.other_stats else {}))
 
 
+def draw_vla_adapter(seed):
+    """The same for VLA-Adapter: both heads, up to three cameras, so many patches that the rows of the task end before, at or behind the image's."""
+    r = random.Random(f"vla_adapter {seed}")
+    is_pro, kv = r.random() < 0.5, r.choice((1, 1, 2, 3))
+    heads = kv * r.choice((1, 2, 4))
+    d_model = next(heads * d_head for d_head in (8, 16, 24, 2, 4) if heads * d_head % (16 if is_pro else 8) == 0) if r.random() < 0.9 else 12 * heads
+    towers = [vla_adapter.Tower(16 * r.choice((1, 2, 3)), r.randint(2, 4), r.randint(10, 60)) for _ in range(2)]
+    text = vla_adapter.decoder(d_model, r.randint(1, 4), heads, kv, r.choice((20, 36, 50)), rms_norm_eps=r.choice((1e-6, 1e-5)),
+                               rope_theta=r.choice((1e6, 1e4)))
+    n_view = r.choice((1, 2, 2, 3))
+    side = 14 * r.choice((1, 2, 3, 4, {1: 22, 2: 16, 3: 13}[n_view], {1: 24, 2: 17, 3: 14}[n_view]))
+    others = r.choice(((), ("libero_goal_no_noops",)))
+    checkpoint = vla_adapter.Checkpoint(
+        *towers, text, side, is_pro=is_pro, platform=r.choice(("libero", "calvin")), n_shard=r.choice((1, 1, 3)), step=r.choice(("", "150000_", "latest_")),
+        prefixes=tuple(r.choice(("", "module.")) for _ in range(2)), has_language_head=r.random() < 0.5, other_stats=others)
+    views = ("third_person", "wrist", "left_wrist")[:n_view] if n_view != 2 or r.random() < 0.5 else ()
+    frame = (r.randint(12, 90), r.randint(12, 90), r.choice(("png", "png", "jpg"))) if r.random() < 0.6 else ()
+    return vla_adapter.case(seed, r.choice((*TEXTS, "", "Pick UP the <tool_call> cube<|im_start|>")), checkpoint, views, frame,
+                            **({"stats": vla_adapter.STATISTICS[checkpoint.platform]} if others else {}))
+
+
 def draw_vla_jepa(seed):
     """The same for VLA-JEPA: prompts, tokens, cameras, steps of the pipeline; in one of ten an instruction that the backbone takes an image for."""
     r = random.Random(f"vla_jepa {seed}")
@@ -561,7 +582,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"{what} {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "openvla": draw_openvla, "openvla_oft": draw_openvla_oft, "pi0_fast": draw_pi0_fast, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "diffusion": draw_diffusion, "openvla": draw_openvla, "openvla_oft": draw_openvla_oft, "pi0_fast": draw_pi0_fast, "turbovla": draw_turbovla, "turbovla_authors": draw_turbovla_authors, "vla_adapter": draw_vla_adapter, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs} | {
     f"groot_{release}": functools.partial(draw_groot, release) for release in groot.DRAWN}

@@ -36,7 +36,7 @@ BASES = {
     "another model's folder": ((MODEL, ("model_type",), ("OTHER",)),),
 }
 MODEL_TYPES = {"bart": "bart", "bert": "bert", "pi": "gemma", "smolvla": "gpt2", "evo1": "qwen2", "eagle": "qwen3", "gr00t": "qwen3_vl", "bitvla": "bart",
-               "openvla": "llama"}
+               "openvla": "llama", "vla_adapter": "qwen2"}
 TEXTS = ("pick it up", "Pick  the red\nblock", "  it's 12 caf\u00e9 ", "pu\u0301sh [SEP] <s> <|im_end|> <eos> go", "", "up.Down<image>x", "\u4e2d\u6587 go")
 CLASSES = ("PreTrainedTokenizerFast", "TokenizersBackend", "GPT2Tokenizer", "Qwen2Tokenizer", "BartTokenizer", "BertTokenizer",
            "GemmaTokenizer", "LlamaTokenizer", "LlamaTokenizerFast", "T5Tokenizer", "CLIPTokenizer", "Qwen2TokenizerFast", "RobertaTokenizer")

@@ -112,6 +112,7 @@ def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
         "diffusion/no_cameras": {n for n in declared if n.startswith("vision.")},
         "openvla_oft/film": two_layers("state", "dino.blk.#.film", "siglip.blk.#.film"),
         "openvla_oft/diffusion": two_layers("noise"),
+        **dict.fromkeys(("vla_adapter/spatial", "vla_adapter/calvin"), {n for n in declared if n.startswith(("head.blk.#.actions.", "head.blk.#.task."))}),
         "vla_jepa/camera": two_layers("state"),
     }
     assert without_numbers(bundle) == declared ^ other.get(name, set())

@@ -14,7 +14,7 @@ from vla_cpp.convert.bundle import read_bundle
 
 sys.path.append(str(ROOT / "tools"))
 from goldens import act, all_cases, bitvla, cases, evo1, families, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7  # noqa: E402
-from goldens import openvla, pi, smolvla, turbovla, turbovla_authors, vla_jepa, xvla  # noqa: E402
+from goldens import openvla, pi, smolvla, turbovla, turbovla_authors, vla_adapter, vla_jepa, xvla  # noqa: E402
 
 D, FF = 192, 272  # widths, of whole blocks of int4 and not; heads have 64 elements
 FEW_ROWS = 144  # matrices from or to fewer elements stay as they are
@@ -45,6 +45,7 @@ WIDE = {
     "turbovla_authors/two_views": {
         "vision": turbovla.vision(D, 3, 3, FF, 8, 4), "text": turbovla.text(D, 2, 3, FF),
         "parts": turbovla_authors.parts(24, (D, 3, 2, FF, D), (6, 2, 3, D, D), {"padding_length": 28})},
+    "vla_adapter/one_view": {"dino": vla_adapter.Tower(D, 2, FF), "siglip": vla_adapter.Tower(D, 2, FF), "text": vla_adapter.decoder(D, 2, 3, 1, FF)},
     "vla_jepa/libero": {"vision": vla_jepa.vision(D, 4, 3, FF, 5, (0, 2, 3)), "text": vla_jepa.text(D, 5, 3, 1, 64, FF, SECTIONS),
                         "policy": vla_jepa.policy(5, 4, (3, 64), 3, D, 6, resize_images_to=[20, 20])},
     "xvla/two_views": {"vision": xvla.vision((48, 96, D), (1, 2, 1), (3, 3, 3), (3, 3, 3), 3, D), "text": xvla.text(D, 2, 3, FF),

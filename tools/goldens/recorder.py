@@ -292,7 +292,7 @@ def read_taps(file):
 # Cases of which every tap is kept: one of each family, and all of BitVLA, whose parts are compared on the reference's own inputs.
 EVERY_TAP = {"act/pre_norm", "bitvla/micro", "bitvla/one_view", "bitvla/two_layers", "diffusion/ddim", "evo1/two_views", "gr00t_n1_5/percentiles",
              "gr00t_n1_6/aspect", "gr00t_n1_7/percentiles", "openvla/bridge", "openvla_oft/libero", "pi0/absent_view", "pi05/long_text", "pi0_fast/stops", "smolvla/long_text",
-             "turbovla/long_text", "turbovla_authors/two_views", "vla_jepa/three_views", "xvla/two_arms"}
+             "turbovla/long_text", "turbovla_authors/two_views", "vla_adapter/one_view", "vla_jepa/three_views", "xvla/two_arms"}
 
 
 def outline(taps):

@@ -19,6 +19,7 @@ SMOLLM_SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>"]
 GEMMA_SPECIAL = ["<pad>", "<eos>", "<bos>", "<unk>"]
 LLAMA2 = ["<unk>", "<s>", "</s>"]
 INTERNVL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<img>", "</img>", "<IMG_CONTEXT>", "<quad>", "</quad>"]
+QWEN2_WORDS = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
 QWEN_VL = [f"<|{name}|>" for name in (
     "endoftext", "im_start", "im_end", "object_ref_start", "object_ref_end", "box_start", "box_end", "quad_start", "quad_end",
     "vision_start", "vision_end", "vision_pad", "image_pad", "video_pad")]
@@ -214,6 +215,33 @@ def openvla(folder, n_piece=150):
         "use_default_system_prompt": False}, indent=1) + "\n")
 
 
+def vla_adapter(folder, n_merge=116):
+    """Qwen2's rules with other merges, in the form that tokenizers 0.19 reads (a merge is one text), and one added token that is not special."""
+    from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, trainers
+
+    fast = Tokenizer(models.BPE())
+    fast.normalizer, fast.decoder = normalizers.NFC(), decoders.ByteLevel()
+    fast.pre_tokenizer = pre_tokenizers.Sequence([
+        pre_tokenizers.Split(Regex(QWEN2_WORDS), "isolated"), pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)])
+    system = "system\nYou are Qwen, created by Alibaba Cloud. You are a helpful assistant."
+    corpus = [f"{system}\nuser\nWhat action should the robot take to {task}?\nassistant\n" for task in TASKS]
+    fast.train_from_iterator(corpus, trainers.BpeTrainer(
+        vocab_size=256 + n_merge, initial_alphabet=pre_tokenizers.ByteLevel.alphabet(), show_progress=False))
+    fast.add_special_tokens([AddedToken(t, special=True, normalized=False) for t in INTERNVL[:3]])
+    fast.add_tokens([AddedToken("<tool_call>", normalized=False)])
+    spec = json.loads(fast.to_str())
+    spec["model"]["merges"] = [merge if isinstance(merge, str) else " ".join(merge) for merge in spec["model"]["merges"]]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "tokenizer.json").write_text(json.dumps(spec, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / "tokenizer_config.json").write_text(json.dumps({
+        "add_bos_token": False, "add_prefix_space": False,
+        "added_tokens_decoder": {str(t["id"]): {k: v for k, v in t.items() if k != "id"} for t in spec["added_tokens"]},
+        "additional_special_tokens": INTERNVL[1:3], "auto_map": {"AutoProcessor": "processing_prismatic.PrismaticProcessor"}, "bos_token": None,
+        "clean_up_tokenization_spaces": False, "eos_token": "<|endoftext|>", "errors": "replace", "model_max_length": 131072,
+        "pad_token": "<|endoftext|>", "processor_class": "PrismaticProcessor", "split_special_tokens": False, "tokenizer_class": "Qwen2Tokenizer",
+        "unk_token": None}, indent=1) + "\n")
+
+
 if __name__ == "__main__":
     {"bart": bart, "bert": bert, "bitvla": bitvla, "eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t,
-     "openvla": openvla}[sys.argv[1]](Path(sys.argv[2]))
+     "openvla": openvla, "vla_adapter": vla_adapter}[sys.argv[1]](Path(sys.argv[2]))
