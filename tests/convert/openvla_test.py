@@ -78,11 +78,11 @@ def test_the_stored_weights_read_pixels_from_0_to_1(converter):
 
 
 def test_stated_results_replace_the_means_they_would_be_made_from(converter):
-    plain = converter.bundle(Saved(), stats="bridge_orig").tensors["dino.patch_embed.bias"]
+    plain = converter.bundle(saved(), stats="bridge_orig").tensors["dino.patch_embed.bias"]
     other = {"means": [[0.25] * 3] * 2}
-    stated = converter.bundle(Saved(preprocessor_config=lambda c: c.update(other)), stats="bridge_orig")
+    stated = converter.bundle(saved(preprocessor_config=lambda c: c.update(other)), stats="bridge_orig")
     assert (stated.tensors["dino.patch_embed.bias"] == plain).all()
-    made = converter.bundle(Saved(preprocessor_config=lambda c: (c.update(other), c.pop("tvf_normalize_params"))), stats="bridge_orig")
+    made = converter.bundle(saved(preprocessor_config=lambda c: (c.update(other), c.pop("tvf_normalize_params"))), stats="bridge_orig")
     assert (made.tensors["dino.patch_embed.bias"] != plain).any()
 
 

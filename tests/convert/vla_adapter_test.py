@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import saved
 from goldens import vla_adapter
 from goldens.draw import bfloat16
 from goldens.openvla import MEANS, STDS, Tower
 from goldens.parameters import decoder
 from goldens.vla_adapter import STATISTICS
 from manifests import check_keys, check_parameters
+from saved import Saved
 from tokenizer_from_keys import ids_of, tokenizer_of
 from vla_cpp.convert.archs.vla_adapter import mapping
 from vla_cpp.convert.errors import Code, Problems
@@ -26,8 +26,8 @@ ORIGINAL = replace(SMALL, is_pro=False)
 PIXELS = [{"mean": tuple(mean), "std": tuple(std)} for mean, std in zip(MEANS, STDS)]
 
 
-class Saved(saved.Saved):
-    small, seed = SMALL, SEED
+def saved(checkpoint=SMALL, **changes):
+    return Saved(checkpoint, SEED, **changes)
 
 
 def all_shapes(checkpoint):
@@ -71,7 +71,7 @@ def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(publis
 
 
 def test_the_versions_of_the_head_have_their_own_keys_and_values(converter):
-    pro, original = converter.bundle(Saved(), platform="libero"), converter.bundle(Saved(ORIGINAL), platform="libero")
+    pro, original = converter.bundle(saved(), platform="libero"), converter.bundle(saved(ORIGINAL), platform="libero")
     assert (pro.keys["head.version"], original.keys["head.version"]) == ("pro", "original")
     parts = {name[len("head.blk.1.") :] for name in pro.tensors if name.startswith("head.blk.1.") and "attn_" in name}
     assert {"actions.attn_k.weight", "task.attn_v.bias", "attn_q.weight"} < parts
@@ -84,12 +84,12 @@ def test_the_versions_of_the_head_have_their_own_keys_and_values(converter):
 def test_the_head_and_the_projector_are_rounded_as_the_reference_loads_them(converter):
     w = SMALL.value("proprio_projector", "fc1.weight", (32, 8), SEED)
     assert (w != bfloat16(w)).any()
-    assert (converter.bundle(Saved(), dtype="f32", platform="libero").tensors["state_in.weight"] == bfloat16(w)).all()
+    assert (converter.bundle(saved(), dtype="f32", platform="libero").tensors["state_in.weight"] == bfloat16(w)).all()
 
 
 def test_names_of_files_prefixes_shards_and_a_tied_head_make_one_bundle(converter):
     def content(checkpoint):
-        bundle = converter.bundle(Saved(checkpoint), platform="libero")
+        bundle = converter.bundle(saved(checkpoint), platform="libero")
         return {name: tensor.tobytes() for name, tensor in bundle.tensors.items()}
 
     first = content(SMALL)
@@ -100,14 +100,14 @@ def test_names_of_files_prefixes_shards_and_a_tied_head_make_one_bundle(converte
 def test_of_tied_rows_of_tokens_the_last_ones_count(converter):
     tied = {"config": lambda c: c["text_config"].update(tie_word_embeddings=True)}
     for changes, name in (({}, "language_model.model.embed_tokens.weight"), (tied, "language_model.lm_head.weight")):
-        rows = converter.bundle(Saved(**changes), dtype="f32", platform="libero").tensors["lm.token_embd.weight"]
+        rows = converter.bundle(saved(**changes), dtype="f32", platform="libero").tensors["lm.token_embd.weight"]
         assert (rows == SMALL.value("model", name, rows.shape, SEED)).all()
 
 
 def test_a_robot_is_a_platform_of_theirs(converter):
-    error = converter.refusal(Saved())
+    error = converter.refusal(saved())
     assert "--platform: expected libero or calvin, found none" in str(error) and error.code == Code.USAGE
-    libero, calvin = (converter.bundle(Saved(), platform=name).keys for name in ("libero", "calvin"))
+    libero, calvin = (converter.bundle(saved(), platform=name).keys for name in ("libero", "calvin"))
     assert libero["observation.views"] == ["observation.images.image", "observation.images.image2"]
     assert libero["observation.view_aliases"] == ["observation.images.full_image", "observation.images.wrist_image"]
     assert calvin["observation.views"] == ["observation.images.rgb_static", "observation.images.rgb_gripper"]
@@ -123,7 +123,7 @@ def test_a_robot_is_a_platform_of_theirs(converter):
 
 def test_statistics_are_chosen_by_their_data_set(converter):
     several = replace(SMALL, other_stats=("libero_goal_no_noops",))
-    assert "expected one of libero_spatial_no_noops, libero_goal_no_noops, found 2" in str(converter.refusal(Saved(several), platform="libero"))
+    assert "expected one of libero_spatial_no_noops, libero_goal_no_noops, found 2" in str(converter.refusal(saved(several), platform="libero"))
     bundle = converter.bundle(stats="libero_goal_no_noops", platform="libero")
     expected = several.statistics(SEED + 1)
     for feature, key in (("observation.state", "proprio"), ("action", "action")):
@@ -132,7 +132,7 @@ def test_statistics_are_chosen_by_their_data_set(converter):
 
 
 def test_the_prompt_is_a_question_to_qwen(converter):
-    bundle = converter.bundle(Saved(), platform="libero")
+    bundle = converter.bundle(saved(), platform="libero")
     text = json.loads(bundle.keys["processor.recipe"])["text"]
     assert [op["op"] for op in text] == ["lower", "template", "tokenize"]
     tokenizer = tokenizer_of(bundle.keys)
@@ -145,7 +145,7 @@ def test_the_prompt_is_a_question_to_qwen(converter):
 
 def test_the_towers_read_pixels_as_the_published_files_say(converter):
     """Of means in full and rounded ones, the latter."""
-    bundle = converter.bundle(Saved(), platform="libero")
+    bundle = converter.bundle(saved(), platform="libero")
     name = "vision_backbone.featurizer.patch_embed.proj."
     weight, bias = (SMALL.value("model", name + part, SMALL.shapes()["model"][name + part], SEED) for part in ("weight", "bias"))
     expected = bias - (weight * np.reshape(np.divide(MEANS[0], STDS[0]), (3, 1, 1))).sum((1, 2, 3))
@@ -194,19 +194,19 @@ REFUSED = [
 
 @pytest.mark.parametrize("changes, part, code", REFUSED, ids=[str(i) + " " + part for i, (_, part, _) in enumerate(REFUSED)])
 def test_what_is_not_understood_is_refused_by_name(converter, changes, part, code):
-    error = converter.refusal(Saved(**changes), platform="libero")
+    error = converter.refusal(saved(**changes), platform="libero")
     assert part in str(error) and code in {problem.code for problem in error.problems}
 
 
 def test_a_head_of_another_robot_or_width_is_refused(converter):
-    assert "8 numbers of state and 7 of an action" in str(converter.refusal(Saved(replace(SMALL, d_state=7)), platform="calvin"))
+    assert "8 numbers of state and 7 of an action" in str(converter.refusal(saved(replace(SMALL, d_state=7)), platform="calvin"))
     odd = replace(SMALL, text=decoder(24, 2, 2, 1, 24))
-    assert "hidden_size: expected a multiple of 16" in str(converter.refusal(Saved(odd), platform="libero"))
-    assert converter.bundle(Saved(replace(odd, is_pro=False)), platform="libero").keys["head.version"] == "original"
+    assert "hidden_size: expected a multiple of 16" in str(converter.refusal(saved(odd), platform="libero"))
+    assert converter.bundle(saved(replace(odd, is_pro=False)), platform="libero").keys["head.version"] == "original"
 
 
 def test_a_missing_file_and_one_of_another_step_are_refused_by_name(converter):
-    converter.save(Saved())
+    converter.save(saved())
     head = converter.folder / "action_head--150000_checkpoint.pt"
     proprio = converter.folder / "proprio_projector--150000_checkpoint.pt"
     head.rename(converter.folder / "head.pt")
@@ -217,7 +217,7 @@ def test_a_missing_file_and_one_of_another_step_are_refused_by_name(converter):
 
 
 def test_towers_with_film_are_refused(converter):
-    converter.save(Saved())
+    converter.save(saved())
     (converter.folder / "vision_backbone--150000_checkpoint.pt").write_bytes(b"")
     error = converter.refusal(platform="libero")
     assert "vision_backbone--150000_checkpoint.pt" in str(error) and "use_film" in str(error) and error.code == Code.UNSUPPORTED
