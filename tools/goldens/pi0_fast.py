@@ -131,7 +131,7 @@ class Checkpoint:
 
     @property
     def n_vocab(self):
-        return N_TOKEN + 1 + self.n_action_token
+        return 257152 if self.size == "full" else N_TOKEN + 1 + self.n_action_token
 
     def dims(self):
         if self.size == "full":
@@ -158,6 +158,7 @@ class Checkpoint:
             x *= 4
         if name.endswith("lm_head.weight"):
             x[N_TOKEN + 1 :] *= 2
+            x[N_TOKEN + 1 + self.n_action_token :] = 0  # of no tokenizer
             for token, bits in self.rows.items():
                 x[token] = [f32(0.5 if bits >> i & 1 else -0.5) for i in range(shape[1])]
         return bfloat16(x)
@@ -215,6 +216,12 @@ CASES = {
         d_state=14, d_action=5,
         rows={318: 0x46C0859E, 273: 0xCCC4D54C, 300: 0x42405DE3, 631: 0xCCC8871A, 459: 0x4280CDDD, 640: 0xAA00A51C})),
 }
+
+
+def published(views, arch="pi0_fast"):
+    """The published size, 2.9 G parameters, with the small tokenizers: it says actions without a prefix, and does not stop."""
+    return Checkpoint({"dtype": "bfloat16", "max_decoding_steps": 64, **FREE}, tower(1152, 27, 16, 4304), gemma(2048, 18, 8, 1, 256, 16384), views,
+                      d_state=8, size="full")
 
 
 # --- the reference -----------------------------------------------------------------------------------------------------
