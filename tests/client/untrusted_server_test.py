@@ -333,11 +333,15 @@ LARGE = {
 
 @pytest.mark.parametrize("name", LARGE)
 def test_messages_of_many_values_are_refused_at_once(name):
+    """The fastest of three: bytes are copied beside other work."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    start = time.process_time()
-    with pytest.raises(vla_cpp.Incompatible, match="more than (4096 values|8 levels)"):
-        unpack(LARGE[name], "server")
-    assert time.process_time() - start < 2  # to make the values takes 4 s; a copy of the bytes is allowed, beside other work
+    seconds = []
+    for _ in range(3):
+        start = time.process_time()
+        with pytest.raises(vla_cpp.Incompatible, match="more than (4096 values|8 levels)"):
+            unpack(LARGE[name], "server")
+        seconds.append(time.process_time() - start)
+    assert min(seconds) < 0.5
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 << 10  # KiB: a copy of the bytes
 
 
