@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import re
-from typing import Dict, List, Sequence, Tuple
+from typing import Callable, Dict, List, Sequence, Tuple
 
 import numpy as np
 
@@ -130,11 +130,13 @@ def projector(target: str, source: str, d: int, d_in: int) -> Rows:
     return in_bf16(linear(target + "_in", source + "fc1", d, d_in) + linear(target + "_out", source + "fc2", d, d))
 
 
-def head(source: str, d: int, d_action: int) -> Rows:
-    """The MLP-ResNet below `source`, which ends in a dot."""
+def head(
+    source: str, d: int, d_action: int, n_layer: int = N_HEAD_LAYER, attention: Callable[[str, str], Rows] = lambda target, source: []
+) -> Rows:
+    """The MLP-ResNet below `source`, which ends in a dot. `attention`: rows that a block has in front of its MLP, below both its names."""
     d_in = d_action * d
     rows = norm("head.in_norm", source + "layer_norm1", d_in) + linear("head.in", source + "fc1", d, d_in)
-    for i in range(N_HEAD_LAYER):
-        target, block = "head.blk.{}.".format(i), "{}mlp_resnet_blocks.{}.ffn.".format(source, i)
-        rows += norm(target + "norm", block + "0", d) + linear(target + "linear", block + "1", d, d)
+    for i in range(n_layer):
+        target, block = "head.blk.{}.".format(i), "{}mlp_resnet_blocks.{}.".format(source, i)
+        rows += attention(target, block) + norm(target + "norm", block + "ffn.0", d) + linear(target + "linear", block + "ffn.1", d, d)
     return in_bf16(rows + norm("head.out_norm", source + "layer_norm2", d) + linear("head.out", source + "fc2", d_action, d))

@@ -18,7 +18,7 @@ from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
 from ...files import member
-from ...layers import QWEN2, Rows, linear, norm, table, vector
+from ...layers import QWEN2, Rows, linear, table, vector
 from ...networks import NORM_EPS, Language, Vision, check_heads, decoder, defaults, keys_of, pick, read_language
 from ...section import Fixed, Section
 from .. import Dropped, oft
@@ -120,20 +120,15 @@ def weights(s: Sizes, pixels: List[Dict[str, tuple]]) -> Rows:
         *decoder(s.lm, LM, QWEN2, tokens=s.tokens),
         *table("queries", QUERIES, N_QUERY, s.lm.d_model),
         *oft.projector("state", oft.PROPRIO, s.lm.d_model, s.d_state),
-        *oft.in_bf16(_head(s)),
+        *oft.head(HEAD, s.lm.d_model, s.d_action, s.lm.n_layer, lambda target, source: _attention(s, target, source)),
     ]
 
 
-def _head(s: Sizes) -> Rows:
-    d, d_in = s.lm.d_model, s.d_action * s.lm.d_model
-    rows = norm("head.in_norm", HEAD + "layer_norm1", d_in) + linear("head.in", HEAD + "fc1", d, d_in)
-    for i in range(s.lm.n_layer):
-        target, at = "head.blk.{}.".format(i), "{}mlp_resnet_blocks.{}.".format(HEAD, i)
-        for ours, theirs in _projections(s.is_pro):
-            rows += linear(target + ours, at + theirs, d, d)
-        rows += vector(target + "gate.weight", at + "gating_factor", 1)
-        rows += norm(target + "norm", at + "ffn.0", d) + linear(target + "linear", at + "ffn.1", d, d)
-    return rows + norm("head.out_norm", HEAD + "layer_norm2", d) + linear("head.out", HEAD + "fc2", s.d_action, d)
+def _attention(s: Sizes, target: str, source: str) -> Rows:
+    d, rows = s.lm.d_model, []
+    for ours, theirs in _projections(s.is_pro):
+        rows += linear(target + ours, source + theirs, d, d)
+    return rows + vector(target + "gate.weight", source + "gating_factor", 1)
 
 
 def _projections(is_pro: bool) -> List[Tuple[str, str]]:
