@@ -247,7 +247,7 @@ Status Engine::warm_up(const ActShape& act) noexcept try {
   return no_memory();
 }
 
-/// Prefix and at most `most` steps of what was set.
+/// Prefix and at most `most` steps of what was set. Errors: late, once `is_late` says so before a step.
 Status Engine::solve(Plan& plan, int most, const std::function<bool()>& is_late, std::vector<Tap>& taps) {
   VLA_CHECK(plan.run_prefix(taps));
   for (int k = 0; k < most; ++k) {

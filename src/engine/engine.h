@@ -74,7 +74,7 @@ class Engine {
   /// unsupported, out_of_memory.
   Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                 EncodedObservation& to) const noexcept;
-  /// The device's, with unnormalization. Errors: those of `act`.
+  /// The device's, with unnormalization. Errors: those of `act`; late (EncodedObservation::is_late).
   Result<ActionChunk> compute(EncodedObservation& encoded) noexcept;
   /// Between them: the images go to the device while it computes another act. Errors: out_of_memory.
   Status send_ahead(EncodedObservation& encoded) const noexcept;
