@@ -87,15 +87,8 @@ bool copy_all(int from, int to) {
 
 /// What `write` writes, by way of a file without a name: a pipe cannot be written to out of order.
 bool write_through(int to, const WriteTo& write) {
-  std::error_code ignored;
-  const fs::path folder = fs::temp_directory_path(ignored);
-  int fd = open_unnamed(folder.string(), 0600);
-  if (fd < 0) {
-    const std::string part = beside((folder / "vla").string());
-    fd = open_named(part, 0600);
-    if (fd < 0) return false;
-    ::unlink(part.c_str());
-  }
+  const int fd = open_temporary();
+  if (fd < 0) return false;
   const bool written = write(fd) && copy_all(fd, to);
   const int number = errno;
   ::close(fd);
@@ -134,6 +127,17 @@ std::string behind_links(const std::string& path) {
 }
 
 }  // namespace
+
+int open_temporary() {
+  std::error_code ignored;
+  const fs::path folder = fs::temp_directory_path(ignored);
+  const int unnamed = open_unnamed(folder.string(), 0600);
+  if (unnamed >= 0) return unnamed;
+  const std::string part = beside((folder / "vla").string());
+  const int named = open_named(part, 0600);
+  if (named >= 0) ::unlink(part.c_str());
+  return named;
+}
 
 Result<std::vector<std::byte>> read_file(const std::string& path, std::size_t limit) {
   std::error_code error;

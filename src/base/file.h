@@ -27,6 +27,8 @@ Status write_file(const std::string& path, std::span<const std::byte> bytes);
 /// failure.
 using WriteTo = std::function<bool(int file)>;
 Status write_file(const std::string& path, const WriteTo& write);
+/// An empty file in the folder of temporary files, which is gone when it is closed; -1, with errno set, on failure.
+int open_temporary();
 /// Writes all bytes; false with errno set on failure.
 bool write_all(int file, std::span<const std::byte> bytes);
 inline Status write_file(const std::string& path, const std::string& text) {

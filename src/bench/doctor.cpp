@@ -72,6 +72,11 @@ std::size_t free_memory(const std::string& meminfo, const std::string& limit, co
   return std::min(system, most - std::min(most, now));
 }
 
+std::size_t free_memory() {
+  return free_memory(content("/proc/meminfo"), content("/sys/fs/cgroup/memory.max"),
+                     content("/sys/fs/cgroup/memory.current"));
+}
+
 Result<Machine> examine_machine() {
   VLA_TRY(const std::unique_ptr<Device> device, open_device(0, ""));
   Machine machine;
@@ -80,8 +85,7 @@ Result<Machine> examine_machine() {
   for (const KernelSet& set : usable_kernels()) machine.kernels.push_back(name_of(set));
   machine.load = std::strtod(first_line("/proc/loadavg").c_str(), nullptr);
   machine.governor = first_line("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor");
-  machine.free_memory = free_memory(content("/proc/meminfo"), content("/sys/fs/cgroup/memory.max"),
-                                    content("/sys/fs/cgroup/memory.current"));
+  machine.free_memory = free_memory();
   machine.roofs = measure_roofs(machine.n_core);
   return machine;
 }

@@ -12,6 +12,8 @@
 #include <nlohmann/json.hpp>
 #include <optional>
 
+#include "base/file.h"
+#include "bench/doctor.h"
 #include "bundle/gguf_writer.h"
 #include "policies/policy.h"
 
@@ -276,7 +278,7 @@ class Values {
   std::string pool_, codes_, ones_, zeros_;
 };
 
-bool write_bundle(int file, const Keys& keys, const ParamList& list, const RandomSizes& sizes) {
+std::vector<TensorInfo> tensors_of(const ParamList& list, const RandomSizes& sizes) {
   std::vector<TensorInfo> tensors;
   std::vector<std::byte> nothing;
   for (const Param& param : list.params()) {
@@ -285,6 +287,19 @@ bool write_bundle(int file, const Keys& keys, const ParamList& list, const Rando
     tensor.data = {nothing.data(), dtype_size(tensor.type, tensor.count())};
     tensors.push_back(std::move(tensor));
   }
+  return tensors;
+}
+
+/// Memory, or a file on the disk where memory has no room for the weights and their copy in an engine; -1 on failure.
+int open_bundle(const std::vector<TensorInfo>& tensors, const RandomSizes& sizes) {
+  std::size_t size = 0;
+  for (const TensorInfo& tensor : tensors) size += tensor.data.size();
+  const bool is_large = sizes.is_filled && size > free_memory() / 5 * 2;
+  return is_large ? open_temporary() : ::memfd_create("random bundle", MFD_CLOEXEC);
+}
+
+bool write_bundle(int file, const Keys& keys, const ParamList& list, const std::vector<TensorInfo>& tensors,
+                  const RandomSizes& sizes) {
   BundleFile out(file, keys, tensors);
   std::optional<Values> values;
   if (sizes.is_filled) values.emplace(list, sizes);
@@ -307,10 +322,12 @@ Result<RandomBundle> RandomBundle::make(const std::string& arch, const Keys& net
   ParamList list(keys, nullptr);
   const std::unique_ptr<Policy> policy = entry.make(list);
   VLA_CHECK(list.report(arch, {}));
-  RandomBundle bundle(::memfd_create("random bundle", MFD_CLOEXEC));
-  if (bundle.file_ < 0 || !write_bundle(bundle.file_, keys, list, sizes))
-    return Error{Code::out_of_memory, "random weights", "", "the system has no memory for a bundle of this size",
-                 "use a machine with more memory, or a 16-bit --dtype"};
+  const std::vector<TensorInfo> tensors = tensors_of(list, sizes);
+  RandomBundle bundle(open_bundle(tensors, sizes));
+  if (bundle.file_ < 0 || !write_bundle(bundle.file_, keys, list, tensors, sizes) || ::fdatasync(bundle.file_) != 0)
+    return Error{Code::out_of_memory, "random weights", "",
+                 "neither memory nor the folder of temporary files has room for a bundle of this size",
+                 "use a machine with more memory, a 16-bit --dtype, or a TMPDIR on a larger disk"};
   return bundle;
 }
 

@@ -16,9 +16,9 @@ struct RandomSizes {
   bool is_filled = true;  // else weights read as zeros and take no memory
 };
 
-/// A valid bundle of random weights in memory, to measure a network of that size without a checkpoint. Nothing is
-/// written to disk, and the memory is freed with the object. Values repeat after some millions, which does not change a
-/// product's time.
+/// A valid bundle of random weights, to measure a network of that size without a checkpoint. It is kept in memory, or,
+/// where that has no room for the bundle and an engine's copy of it, in a temporary file without a name, and is gone
+/// with the object. Values repeat after some millions, which does not change a product's time.
 class RandomBundle {
  public:
   /// `network` has the keys that the architecture declares, such as PolicyEntry::published. Features, recipe, solver
