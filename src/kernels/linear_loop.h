@@ -111,7 +111,7 @@ class LinearLoop {
       : job_(job),
         block_rows_(even_block(job.n_row, kBlockRows, kRows)),
         n_block_(ceil_div(job.n_row, block_rows_)),
-        block_depth_(even_block(job.d_in, Tile::kMaxDepth, kPanelDepth)),
+        block_depth_(even_block(job.d_in, max_depth(job), kPanelDepth)),
         n_panel_(Stripes::n_panel(job)) {}
 
   static VLA_INLINE std::int64_t place(std::int64_t r, std::int64_t k) {
@@ -119,6 +119,13 @@ class LinearLoop {
       return Tile::place(r, k);
     else
       return r * Tile::kXStride + k;
+  }
+
+  /// A block of one row has room for more of the depth, so that memory is read from one end of a panel to the other.
+  static std::int64_t max_depth(const LinearJob& job) {
+    constexpr std::int64_t kOneRow = 8 * Tile::kMaxDepth;
+    static_assert(kOneRow <= kBlockRows / 2 * Tile::kXStride);
+    return job.n_row == 1 && job.window.size == 0 ? kOneRow : Tile::kMaxDepth;
   }
 
   bool whole_depth() const { return block_depth_ >= job_.d_in; }

@@ -234,7 +234,7 @@ void check_gates_and_groups(const LinearKernel& kernel) {
 
 /// The depth takes several blocks, of float32 and of bf16, and the panels several items.
 void check_depths(const LinearKernel& kernel) {
-  const Case deep = {.shape = {390, 2080, 33}, .activation = Activation::gelu_tanh, .with_residual = true};
+  Case deep = {.shape = {390, 2080, 33}, .activation = Activation::gelu_tanh, .with_residual = true};
   check(kernel, deep);
   Case gated = deep;
   gated.n_part = 2, gated.gated = true, gated.n_thread = 2;
@@ -243,6 +243,11 @@ void check_depths(const LinearKernel& kernel) {
   wide.shape = {270, 2080, 780};
   if (rounds(kernel)) wide.x_type = DType::bf16;
   check(kernel, wide);
+  for (const std::int64_t depth : {9000, 17000}) {  // of one row: one block, and several
+    deep.shape = gated.shape = {1, depth, 70};
+    check(kernel, deep);
+    check(kernel, gated);
+  }
 }
 
 void check_threads(const LinearKernel& kernel) {
