@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <xxhash.h>
 
+#include <algorithm>
 #include <array>
 #include <cstring>
 #include <exception>
@@ -83,13 +84,17 @@ Recorder::Recorder(std::string path, int fd, std::uint64_t max_bytes)
 }
 
 /// A server that never got to serve leaves no file in the way of the next one.
-Recorder::~Recorder() {
+void Recorder::close() {
   if (n_record_ > 0) {
     writer_.set_tail(record_of("VEND", n_record_, 0, 0, "", ""));
   } else {
     std::error_code ignored;
     std::filesystem::remove(path_, ignored);
   }
+  writer_.close();
+  if (writer_.failure() == 0 || !why_stopped_.empty()) return;
+  why_stopped_ = std::strerror(writer_.failure());
+  if (n_record_ > 0) n_record_ -= std::min(static_cast<std::uint32_t>(writer_.n_dropped()), n_record_ - 1);
 }
 
 void Recorder::describe(const v1::Description& description) {

@@ -27,7 +27,10 @@ class Recorder final : public Observer {
  public:
   /// Creates the folder if it is missing. A folder with a recording is refused. Errors: io.
   static Result<std::unique_ptr<Recorder>> open(const std::string& folder, std::uint64_t max_bytes);
-  ~Recorder() override;
+  ~Recorder() override { close(); }
+
+  /// Writes what waits and ends the file. If the disk failed meanwhile, recording stopped then, and nobody was told.
+  void close();
 
   /// Describes the server. Call it before the first request.
   void describe(const v1::Description& description);

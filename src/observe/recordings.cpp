@@ -27,6 +27,13 @@ Status Recordings::open() {
   return begin_in(folder_);
 }
 
+/// What could not be written any more is told too.
+Recordings::~Recordings() {
+  const bool was_on = standing().on;
+  close();
+  if (was_on && !last_.why.empty() && tell_) tell_(last_);
+}
+
 void Recordings::describe(const v1::Description& description) {
   const std::lock_guard lock(mutex_);
   description_ = description;
@@ -70,11 +77,18 @@ Status Recordings::begin_in(const std::string& folder) {
 
 /// Flushes to disk without the lock, so that requests do not wait for it.
 void Recordings::close() {
-  std::unique_ptr<Recorder> closed;  // after the lock
+  std::unique_ptr<Recorder> closed;
+  {
+    const std::lock_guard lock(mutex_);
+    last_ = now();
+    last_.on = false;
+    closed = std::move(recorder_);
+  }
+  if (!closed) return;
+  closed->close();
   const std::lock_guard lock(mutex_);
-  last_ = now();
-  last_.on = false;
-  closed = std::move(recorder_);
+  last_.why = closed->why_stopped();
+  last_.n_request = closed->n_recorded();
 }
 
 void Recordings::answered(const Answered& answered) {

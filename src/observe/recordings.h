@@ -28,6 +28,8 @@ class Recordings final : public Observer {
   /// `max_bytes`: limit of all recordings together.
   Recordings(std::string folder, std::uint64_t max_bytes) : folder_(std::move(folder)), max_bytes_(max_bytes) {}
 
+  ~Recordings() override;
+
   /// Starts the recording in the folder itself. Errors: io.
   Status open();
   /// Describes the server. Call it before the first request.

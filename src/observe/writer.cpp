@@ -47,7 +47,8 @@ Writer::Writer(int fd, Owns owns, std::size_t max_waiting) : fd_(fd), owns_(owns
   }
 }
 
-Writer::~Writer() {
+void Writer::close() {
+  if (fd_ < 0) return;
   {
     const std::lock_guard lock(mutex_);
     closing_ = true;
@@ -57,6 +58,7 @@ Writer::~Writer() {
   if (thread_.joinable()) thread_.join();
   write_tail();
   if (owns_ == Owns::yes) ::close(fd_);
+  fd_ = -1;
 }
 
 bool Writer::put(std::string piece) noexcept {

@@ -27,13 +27,14 @@ class Writer {
   /// `fd` is closed at the end where it is owned. At most `max_waiting` bytes wait. Without a thread it has failed from
   /// the start. A closed pipe is a failure too, not a signal.
   Writer(int fd, Owns owns, std::size_t max_waiting);
-  /// Writes what waits, then `tail`, for as long as somebody reads.
-  ~Writer();
+  ~Writer() { close(); }
   Writer(const Writer&) = delete;
   Writer& operator=(const Writer&) = delete;
 
   /// From any thread. False where the piece was dropped.
   bool put(std::string piece) noexcept;
+  /// Writes what waits, then `tail`, for as long as somebody reads, and closes the file. Nothing may be put afterwards.
+  void close();
   /// Sets the text that comes after every piece that was put, and is not dropped. Where the disk is full, nothing comes
   /// after what is there; or, `over_last`, the text takes the place of the last piece of a file.
   void set_tail(std::string tail, bool over_last = false) { tail_ = std::move(tail), over_last_ = over_last; }
@@ -47,7 +48,7 @@ class Writer {
   void write_tail();
   bool is_out_of_patience() const;
 
-  const int fd_;
+  int fd_;  // -1 once it is closed
   const Owns owns_;
   const std::size_t max_waiting_;
   bool is_file_ = false;
