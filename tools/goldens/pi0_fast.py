@@ -84,12 +84,14 @@ class Fast:
         (folder / "processing_action_tokenizer.py").write_text(PROCESSOR, encoding="utf-8")
 
 
-def write_tokenizer(n_action, folder):
-    """That of the other cases of π0 with a token for the end of actions and `n_action` behind it, of which FAST's ids are the first; "Action"
-    and ":" stay two tokens, as PaliGemma's are."""
+def write_tokenizer(n_action, n_vocab, folder):
+    """That of the other cases of π0 with a token for the end of actions and `n_action` as the last of `n_vocab`, of which FAST's ids are the
+    first; "Action" and ":" stay two tokens, as PaliGemma's are."""
     source = pi.RECORDED / "tokenizers/pi"
     spec = json.loads((source / "tokenizer.json").read_text())
-    spec["model"]["vocab"] |= {STOP: N_TOKEN} | {f"<loc{i:04}>": N_TOKEN + 1 + i for i in range(n_action)}
+    first = n_vocab - n_action
+    spec["model"]["vocab"] |= {STOP: N_TOKEN} | {f"<unused{i}>": i for i in range(N_TOKEN + 1, first)}
+    spec["model"]["vocab"] |= {f"<loc{i:04}>": first + i for i in range(n_action)}
     spec["model"]["merges"].remove(["Action", ":"])
     write_json(folder / "tokenizer.json", spec)
     (folder / "tokenizer_config.json").write_bytes((source / "tokenizer_config.json").read_bytes())
@@ -157,8 +159,9 @@ class Checkpoint:
         if "language_model" in name and name.endswith(("down_proj.weight", "o_proj.weight")):
             x *= 4
         if name.endswith("lm_head.weight"):
-            x[N_TOKEN + 1 :] *= 2
-            x[N_TOKEN + 1 + self.n_action_token :] = 0  # of no tokenizer
+            x[-self.n_action_token :] *= 2
+            if self.size == "full":  # what stands for no action
+                x[N_TOKEN + 1 : -self.n_action_token] = x[-self.config["fast_skip_tokens"] :] = 0
             for token, bits in self.rows.items():
                 x[token] = [f32(0.5 if bits >> i & 1 else -0.5) for i in range(shape[1])]
         return bfloat16(x)
@@ -168,7 +171,7 @@ class Checkpoint:
         folder, c, shapes = Path(folder), self.config, self.shapes()
         write_json(folder / "config.json", c, indent=2)
         write_json(folder / "dims.json", self.dims(), indent=1)
-        write_tokenizer(self.n_action_token, folder / "tokenizer")
+        write_tokenizer(self.n_action_token, self.n_vocab, folder / "tokenizer")
         self.fast.write(folder / "action_tokenizer")
         self.write_pipelines(c, seed, folder)
         shared = {f"{TOWER}model.language_model.embed_tokens.weight": f"{TOWER}lm_head.weight"}
