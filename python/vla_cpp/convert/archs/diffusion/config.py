@@ -13,7 +13,6 @@ from typing import Optional, Sequence, Tuple
 from ...checkpoint import Checkpoint
 from ...errors import Problems
 from ...lerobot import action_width, check_keys, no_position_rule, state_width, vector_dim
-from ...recipe import STATE
 from ...section import Section
 from .. import Options
 from ..act.config import BACKBONES, ENVIRONMENT, MAX_SIDE, cameras_of

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import Dict, List, Tuple
+from typing import Dict, List, Set, Tuple
 
 import numpy as np
 
@@ -77,18 +77,13 @@ class Sizes:
 
 
 def read_sizes(checkpoint: Checkpoint, problems: Problems) -> Sizes:
-    s, config = Sizes(), checkpoint.config
-    top = Section(WHERE, config, TOP, problems)
+    s = Sizes()
+    top = Section(WHERE, checkpoint.config, TOP, problems)
     top.refuse_unknown({*TOP, *TOP_FIXED, *IGNORED})
     top.check_fixed(TOP_FIXED)
     _check_backbones(top)
-    text = Section(WHERE + ": text_config", member(config, "text_config", dict, WHERE), TEXT, problems, ("num_key_value_heads",))
-    text.check_fixed(TEXT_FIXED)
-    text.refuse_unknown({*TEXT, *TEXT_FIXED, *IGNORED, "num_key_value_heads", "head_dim"})
-    s.lm = read_language(text)
-    s.lm.rope_base, s.lm.d_head = text.number("rope_theta"), s.lm.d_model // s.lm.n_head
-    text.fixed("head_dim", s.lm.d_head)
-    check_heads(text, s.lm)
+    text = text_section(checkpoint, TEXT, TEXT_FIXED, IGNORED | {"num_key_value_heads"}, problems)
+    s.lm = read_text(text)
     s.n_bin = top.count("n_action_bins", 2)
     s.first_id = s.lm.n_vocab - top.count("pad_to_multiple_of", 0) - 1
     if s.first_id < s.n_bin:
@@ -98,6 +93,23 @@ def read_sizes(checkpoint: Checkpoint, problems: Problems) -> Sizes:
     s.stop_token = section.count("eos_token_id", 0, s.lm.n_vocab - 1)
     read_towers(checkpoint, s, top)
     return s
+
+
+def text_section(checkpoint: Checkpoint, keys: Dict, fixed: Fixed, ignored: Set[str], problems: Problems) -> Section:
+    """The language model's part of config.json. `keys`: its keys and the defaults of the reference's class."""
+    text = member(checkpoint.config, "text_config", dict, WHERE)
+    section = Section(WHERE + ": text_config", text, keys, problems, ("num_key_value_heads",))
+    section.check_fixed(fixed)
+    section.refuse_unknown({*keys, *fixed, *ignored, "head_dim"})
+    return section
+
+
+def read_text(text: Section) -> Language:
+    lm = read_language(text)
+    lm.rope_base, lm.d_head = text.number("rope_theta"), lm.d_model // lm.n_head
+    text.fixed("head_dim", lm.d_head)
+    check_heads(text, lm)
+    return lm
 
 
 def read_towers(checkpoint: Checkpoint, s, top: Section) -> None:

@@ -17,9 +17,8 @@ from typing import Dict, List, Tuple
 from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...files import member
 from ...layers import QWEN2, Rows, linear, table, vector
-from ...networks import NORM_EPS, Language, Vision, check_heads, decoder, defaults, keys_of, pick, read_language
+from ...networks import NORM_EPS, Language, Vision, decoder, defaults, keys_of, pick
 from ...section import Fixed, Section
 from .. import Dropped, oft
 from ..openvla import mapping as prismatic
@@ -65,14 +64,8 @@ def read_sizes(checkpoint: Checkpoint, problems: Problems) -> Sizes:
     top.check_fixed(prismatic.TOP_FIXED)
     if top.get("llm_backbone_id") not in BACKBONES:
         top.bad("llm_backbone_id", " or ".join(BACKBONES), unsupported=True)
-    where = prismatic.WHERE + ": text_config"
-    text = Section(where, member(checkpoint.config, "text_config", dict, prismatic.WHERE), TEXT, problems, ("num_key_value_heads",))
-    text.check_fixed(TEXT_FIXED)
-    text.refuse_unknown({*TEXT, *TEXT_FIXED, *IGNORED, "head_dim"})
-    s.lm = read_language(text)
-    s.lm.rope_base, s.lm.d_head = text.number("rope_theta"), s.lm.d_model // s.lm.n_head
-    text.fixed("head_dim", s.lm.d_head)
-    check_heads(text, s.lm)
+    text = prismatic.text_section(checkpoint, TEXT, TEXT_FIXED, IGNORED, problems)
+    s.lm = prismatic.read_text(text)
     s.tokens = _token_rows(checkpoint, text)
     prismatic.read_towers(checkpoint, s, top)
     _read_head(checkpoint, s, text)
