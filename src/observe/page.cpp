@@ -185,6 +185,19 @@ void add_state(std::span<const std::byte> message, Json& states, std::size_t& le
   left -= values.size();
 }
 
+Json loop_json(std::span<const std::byte> message) {
+  v1::LoopState loop;
+  if (message.size() > kMaxMessage || !loop.ParseFromArray(message.data(), static_cast<int>(message.size())))
+    return nullptr;
+  return {{"driver", v1::LoopState::Driver_Name(loop.driver())},
+          {"actions", loop.actions()},
+          {"human", loop.human()},
+          {"held", loop.held()},
+          {"missed", loop.missed()},
+          {"limited", loop.limited()},
+          {"refused", loop.refused()}};
+}
+
 Json act_json(std::span<const std::byte> act) {
   Json json = {{"text", nullptr}, {"embodiment", ""}, {"states", Json::object()}, {"views", Json::array()}};
   std::size_t n_value = kMaxValues;
@@ -193,6 +206,7 @@ Json act_json(std::span<const std::byte> act) {
     if (field.type != 'b') return;
     if (field.number == v1::Act::kTextFieldNumber) json["text"] = beginning(view_of(field.value), kMaxText);
     if (field.number == v1::Act::kEmbodimentFieldNumber) json["embodiment"] = beginning(view_of(field.value), kMaxName);
+    if (field.number == v1::Act::kLoopFieldNumber) json["loop"] = loop_json(field.value);
     if (field.number == v1::Act::kStatesFieldNumber) add_state(field.value, json["states"], n_value);
     if (field.number != v1::Act::kViewsFieldNumber || json["views"].size() == kMaxViews) return;
     const View view = read_view(field.value);

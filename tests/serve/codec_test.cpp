@@ -54,6 +54,8 @@ v1::Act full_act() {
   leftover.set_delay(1);
   leftover.set_schedule("exp");
   leftover.set_max_guidance(2.5);
+  act.mutable_loop()->set_driver(v1::LoopState::PERSON);
+  act.mutable_loop()->set_actions(std::uint64_t{1} << 53);
   return act;
 }
 
@@ -121,6 +123,24 @@ TEST_CASE("a leftover whose rows and columns do not make its numbers is refused 
   CHECK_FALSE(decode(act)->leftover->max_guidance.has_value());
   act.clear_leftover();
   CHECK_FALSE(decode(act)->leftover.has_value());
+}
+
+TEST_CASE(
+    "a loop's state without a driver, with a count that none can be or with a field of another version is refused") {
+  v1::Act act = full_act();
+  for (const int driver : {0, 3, -1}) {
+    act.mutable_loop()->set_driver(static_cast<v1::LoopState::Driver>(driver));
+    check_refused(act, driver < 0 ? Code::bad_request : Code::bad_observation, driver < 0 ? "act" : "loop.driver");
+  }
+  act = full_act();
+  act.mutable_loop()->set_actions((std::uint64_t{1} << 53) + 1);
+  check_refused(act, Code::bad_request, "act");
+  act.clear_loop();
+  CHECK(decode(act).ok());
+  const std::string driver = varint_field(1, 1);
+  CHECK(decode(act.SerializeAsString() + bytes_field(11, driver)).ok());
+  for (const std::string& loop : {driver + varint_field(8, 1), driver + bytes_field(2, "1"), std::string("\x08")})
+    CHECK(decode(act.SerializeAsString() + bytes_field(11, loop)).error().code == Code::bad_request);
 }
 
 TEST_CASE("a seed is taken as it is, also zero, and without one a fresh seed is drawn each time") {

@@ -90,7 +90,7 @@ std::string repeated(const std::string& bytes, std::size_t count) {
 std::string request_with(const std::string& act) { return std::string("\x08\x01", 2) + field(5, act); }
 
 constexpr std::size_t kSize = 30 << 20;
-constexpr int kViews = 1, kStates = 2, kText = 3;
+constexpr int kViews = 1, kStates = 2, kText = 3, kLoop = 11;
 
 }  // namespace
 
@@ -116,6 +116,8 @@ TEST_CASE("a refused act of 30 MB, whatever it is made of, is told at once and i
       field(kStates, field(1, std::string(kSize, 'n'))),
       field(kStates, repeated(std::string("\x15\0\0\x80?", 5), kSize / 5)),  // a value a field
       repeated(field(kStates, field(1, "a")), kSize / 5),
+      repeated(field(kLoop, "\x08\x02"), kSize / 4),
+      repeated(field(kLoop, std::string(60'000, '\x08')), kSize / 60'000),
       repeated(field(kViews, ""), kSize / 2),
       field(kViews, field(1, "top") + repeated("\x78\x01", kSize / 2)),
       field(kViews, field(1, "top") + field(2,
@@ -142,6 +144,20 @@ TEST_CASE("a refused act of 30 MB, whatever it is made of, is told at once and i
     watched.get("/image?act=1&view=0&as=seen", seconds);
     CHECK(seconds < 2);
   }
+}
+
+TEST_CASE("the state of a loop is told as the act has it, and nothing where it is none") {
+  const Watched watched;
+  watched.refused(request_with(""));
+  watched.refused(request_with(field(kLoop, "\x08\x02\x10\x07\x38\x01")));
+  watched.refused(request_with(field(kLoop, "\x08\x09")));
+  watched.refused(request_with(field(kLoop, "\x08")));
+  const json acts = watched.acts()["acts"];
+  CHECK_FALSE(acts[0].contains("loop"));
+  CHECK(acts[1]["loop"] == json::parse(R"({"driver": "PERSON", "actions": 7, "human": 0, "held": 0, "missed": 0,
+                                           "limited": 0, "refused": 1})"));
+  CHECK(acts[2]["loop"]["driver"] == "");
+  CHECK(acts[3]["loop"].is_null());
 }
 
 TEST_CASE("texts, names and states are told up to a size, and pixels where they are those of their sides") {

@@ -44,24 +44,26 @@ struct Row {
 };
 
 /// The fields of a message in the order of their numbers, from 1: v varint, u one of 32 bits, b bytes, t text, n a
-/// name, f floats (packed or not), d double, and a digit for a message, the index of its own row.
-constexpr std::array<Row, 9> kFields = {{
-    {"15t3vvv7nn", "embodiment"},  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover,
-                                   // embodiment, policy
-    {"n2bb4", "views"},            // 1 View: name, rgb, jpeg, png, absent
-    {"uub"},                       // 2 RawRgb: width, height, rows
-    {"uuf"},                       // 3 Noise: horizon, d_action, values
-    {""},                          // 4 Absent
-    {"nf", "states"},              // 5 State: name, values
-    {"uutt"},                      // 6 Hello: min_version, max_version, client_name, client_version
+/// name, f floats (packed or not), d double, c count, and a digit for a message, the index of its own row.
+constexpr std::array<Row, 10> kFields = {{
+    {"15t3vvv7nn9", "embodiment"},  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover,
+                                    // embodiment, policy, loop
+    {"n2bb4", "views"},             // 1 View: name, rgb, jpeg, png, absent
+    {"uub"},                        // 2 RawRgb: width, height, rows
+    {"uuf"},                        // 3 Noise: horizon, d_action, values
+    {""},                           // 4 Absent
+    {"nf", "states"},               // 5 State: name, values
+    {"uutt"},                       // 6 Hello: min_version, max_version, client_name, client_version
     {"uufund", "leftover.schedule"},  // 7 Leftover: n_row, d_action, values, delay, schedule, max_guidance
     {"n", "policy"},                  // 8 Describe: policy
+    {"ucccccc"},                      // 9 LoopState: driver, actions, human, held, missed, limited, refused
 }};
 
 /// Whether a field that was read is encoded as its type says.
 bool fits(const Fields& field, char type) {
   if (type == 'v') return field.type == 'v';
-  if (type == 'u') return field.type == 'v' && field.varint <= ~std::uint32_t{0};  // Protobuf would cut it off
+  if (type == 'u') return field.type == 'v' && field.varint <= ~std::uint32_t{0};       // Protobuf would cut it off
+  if (type == 'c') return field.type == 'v' && field.varint <= std::uint64_t{1} << 53;  // exact in JSON
   if (type == 'd') return field.type == 'd';
   return field.type == 'b' || (type == 'f' && field.type == 'f');
 }
@@ -230,6 +232,9 @@ Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits&
   VLA_CHECK(decode_states(act, states, request.observation));
   VLA_CHECK(decode_start(act, limits, request));
   VLA_CHECK(decode_leftover(act, limits, request));
+  if (const int driver = act.loop().driver();
+      act.has_loop() && driver != v1::LoopState::POLICY && driver != v1::LoopState::PERSON)
+    return bad_observation("loop.driver", "POLICY or PERSON", std::to_string(driver));
   return request;
 }
 
@@ -281,9 +286,7 @@ Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes, std::strin
   reply.set_max_version(wire::kMaxVersion);
   reply.set_server_name("vla");
   reply.set_server_version(VLA_VERSION);
-  reply.add_features("leftover");
-  reply.add_features("embodiment");
-  reply.add_features("policy");
+  for (const char* feature : {"leftover", "embodiment", "policy", "loop"}) reply.add_features(feature);
   return reply;
 }
 
