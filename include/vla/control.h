@@ -69,6 +69,15 @@ struct StateVector {
   std::vector<float> values = {};  // world units
 };
 
+/// Counts of a loop since it began or was reset.
+struct LoopStats {
+  std::int64_t actions = 0, held = 0, chunks = 0, stale = 0, failed = 0, limited = 0, refused = 0, missed = 0,
+               notes = 0;
+  std::int64_t human = 0;  // commanded by a person
+  bool is_driven = false;  // a person drives
+  int delay = -1;          // steps of the slowest of the last 16 inferences; -1 before the first
+};
+
 /// The inputs of a policy. The loop fills one Observation again and again; vectors that keep their sizes allocate
 /// nothing.
 struct Observation {
@@ -76,6 +85,7 @@ struct Observation {
   std::vector<StateVector> states = {};
   std::optional<std::string> text = {};  // may be empty; none for a policy that reads no instruction
   std::optional<std::uint64_t> seed = {};
+  std::optional<LoopStats> loop = {};  // set by ChunkLoop: shown by the page of `vla serve`
 };
 
 /// Real-time chunking: rows of the chunk before that are not executed yet.
@@ -308,13 +318,6 @@ struct Action {
   bool human = false;                          // a person commanded it
   std::span<const float> policy = {};          // then: what the policy wanted, before any limit; empty without a row
   const Problem* problem = nullptr;            // of `stopped` and `failed`
-};
-
-struct LoopStats {
-  std::int64_t actions = 0, held = 0, chunks = 0, stale = 0, failed = 0, limited = 0, refused = 0, missed = 0,
-               notes = 0;
-  std::int64_t human = 0;  // commanded by a person
-  int delay = -1;          // steps of the slowest of the last 16 inferences; -1 before the first
 };
 
 /// Turns observations into one action per control period. One thread may use it.

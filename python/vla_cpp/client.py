@@ -9,7 +9,7 @@ import random
 import threading
 import time
 from dataclasses import replace
-from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Union
+from typing import Any, Callable, Dict, FrozenSet, Mapping, Optional, Sequence, Union
 
 import zmq
 from google.protobuf.message import DecodeError
@@ -87,6 +87,12 @@ class Client(Handle):
         """What the policy takes and gives; asked for once. Errors: Timeout, Disconnected, Incompatible."""
         return self._spec or self._learn(self.timeout)
 
+    @property
+    def features(self) -> FrozenSet[str]:
+        """What the server can do beyond what every server can, as docs/protocol.md lists; empty before it has answered at all."""
+        connection = self._connection
+        return connection.features if connection else frozenset()
+
     def act(
         self,
         *,
@@ -131,10 +137,12 @@ class Client(Handle):
         deadline_ms: Optional[float] = None,
         timeout: Optional[float] = None,
         embodiment: Optional[str] = None,
+        loop: Optional[Mapping[str, Any]] = None,
         **observation: Any,
     ) -> Pending:
         """Takes the arguments of `act`, sends them and returns at once: `done()` of the result never waits, `result()` is the chunk.
 
+        `loop` has the fields of a LoopState (src/wire/vla.proto), which a ChunkLoop tells; they are sent where `features` have "loop".
         Only the first call of a client may wait, for the description of the policy.
         """
         check_start(seed, noise)
@@ -149,6 +157,8 @@ class Client(Handle):
 
         def write(request: Any) -> bytes:
             request.act.policy = self.policy or ""
+            if loop is not None and "loop" in self.features:
+                request.act.loop.CopyFrom(wire.MESSAGES["LoopState"](**loop))
             return wire.act_bytes(request, spec, limits, seed=seed, noise=noise, deadline_ms=deadline_ms, **observation)
 
         capture_time_ns = observation.get("capture_time_ns")
@@ -261,6 +271,8 @@ class Client(Handle):
         if response.protocol_version != wire.PROTOCOL_VERSION:
             found = f"version {response.protocol_version}"
             raise Incompatible(self.address, f"answers of protocol version {wire.PROTOCOL_VERSION}", found)
+        if kind == "hello":
+            self._connection.features = frozenset(response.hello.features)
         if kind in ("description", "chunk"):
             self._check_bundle(getattr(response, kind).bundle)
         if kind == "description" and self._spec is not None:

@@ -12,7 +12,7 @@ import math
 import os
 import struct
 from pathlib import Path
-from typing import List, Optional, Tuple, Union
+from typing import FrozenSet, List, Optional, Tuple, Union
 
 import zmq
 from zmq.utils import z85
@@ -50,6 +50,7 @@ class Connection:
     def __init__(self, context: zmq.Context, address: str, curve: Optional[Tuple[bytes, bytes, bytes]]) -> None:
         """curve: the server's public key, our public key, our secret key. Errors: UsageError for an impossible address."""
         self._address = address
+        self.features: FrozenSet[str] = frozenset()  # of the server, once it has answered the greeting
         self._curve = bool(curve)
         self._socket = context.socket(zmq.DEALER)
         self._socket.linger = 0

@@ -133,6 +133,18 @@ Spec spec_of(const v1::Description& whole, const std::string& embodiment, const 
   return spec;
 }
 
+v1::LoopState state_of(const LoopStats& stats) {
+  v1::LoopState state;
+  state.set_driver(stats.is_driven ? v1::LoopState::PERSON : v1::LoopState::POLICY);
+  state.set_actions(static_cast<std::uint64_t>(stats.actions));
+  state.set_human(static_cast<std::uint64_t>(stats.human));
+  state.set_held(static_cast<std::uint64_t>(stats.held));
+  state.set_missed(static_cast<std::uint64_t>(stats.missed));
+  state.set_limited(static_cast<std::uint64_t>(stats.limited));
+  state.set_refused(static_cast<std::uint64_t>(stats.refused));
+  return state;
+}
+
 void add(v1::Act& act, const Frame& frame) {
   v1::View& view = *act.add_views();
   view.set_name(frame.view);
@@ -184,6 +196,7 @@ struct Client::Impl {
   v1::Request request;
   std::uint64_t last_id = std::random_device()(), waits_for = 0;  // 0: for nothing
   std::optional<std::uint64_t> seed;
+  bool takes_loop = false;  // the server knows Act.loop
   Clock::time_point until;
 
   Impl(std::string at, ClientOptions given) : address(std::move(at)), options(std::move(given)) {
@@ -212,6 +225,7 @@ struct Client::Impl {
 
   /// Greets, and asks for the description. Errors: usage, for an address that is none.
   void connect() {
+    takes_loop = false;
     try {
       connection.emplace(context, address, options);
     } catch (const zmq::error_t& error) {
@@ -252,6 +266,7 @@ struct Client::Impl {
           throw Error("incompatible", address, "answers of vla serve", "other bytes", "what listens there?");
         if (response.has_error())
           throw Error(problem_of(response.error()).code, address, "", problem_of(response.error()).message);
+        if (response.has_hello()) greet(response.hello());
         if (response.has_description()) learn(response.description());
       }
       if (spec.horizon == 0 && connection->is_lost())
@@ -259,6 +274,10 @@ struct Client::Impl {
     }
     rows.reserve(static_cast<std::size_t>(spec.horizon) * static_cast<std::size_t>(spec.d_action));
     normalized.reserve(rows.capacity()), leftover.reserve(rows.capacity());
+  }
+
+  void greet(const v1::HelloReply& hello) {
+    takes_loop = std::count(hello.features().begin(), hello.features().end(), "loop") > 0;
   }
 
   void learn(const v1::Description& description) {
@@ -332,6 +351,7 @@ struct Client::Impl {
       sent.mutable_values()->Add(state.values.begin(), state.values.end());
     }
     if (observation->text) act.set_text(*observation->text);
+    if (takes_loop && observation->loop) *act.mutable_loop() = state_of(*observation->loop);
     act.set_policy(options.policy);
     act.set_embodiment(spec.embodiment);
     act.set_deadline_ms(static_cast<std::uint64_t>(std::ceil(1000 * options.timeout)));
@@ -374,6 +394,7 @@ struct Client::Impl {
     if (is_other || (response.has_description() && wire::interface_of(response.description()) != interface))
       return drop(problem_of("incompatible", address, "the policy that was there before: " + spec.bundle,
                              printable(bundle->name()), "make a new Client, and read its spec"));
+    if (response.has_hello()) return greet(response.hello());
     if (waits_for == 0 || response.request_id() != waits_for) return;  // a greeting's, or nobody waits for it
     if (response.has_error()) return finish(problem_of(response.error()));
     if (!response.has_chunk())

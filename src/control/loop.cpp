@@ -100,6 +100,7 @@ struct ChunkLoop::Impl {
 
   void submit(const Observe& observe, std::int64_t at) {
     observe(observation);
+    observation.loop = stats();
     Leftover leftover;
     if (options.mode == Mode::rtc) leftover.rows = schedule.leftover(options.rtc.overlap);
     const int n_row = static_cast<int>(leftover.rows.size()) / policy.spec().d_action;
@@ -108,6 +109,12 @@ struct ChunkLoop::Impl {
     schedule.observe(at);
     policy.submit(observation, n_row > 0 ? &leftover : nullptr);
     is_waiting = true;
+  }
+
+  LoopStats stats() const {
+    LoopStats stats = schedule.counts;
+    stats.missed = n_missed, stats.notes = n_note, stats.delay = schedule.delay(), stats.is_driven = !driver.empty();
+    return stats;
   }
 
   /// False where `last` is a problem that another observation would have again.
@@ -198,13 +205,8 @@ void ChunkLoop::pace() noexcept {
 
 bool ChunkLoop::is_reading() const noexcept { return impl_->policy.is_reading(); }
 const Problem& ChunkLoop::last_problem() const noexcept { return impl_->last; }
+LoopStats ChunkLoop::stats() const noexcept { return impl_->stats(); }
 double ChunkLoop::rate_hz() const noexcept { return impl_->options.rate_hz; }
-
-LoopStats ChunkLoop::stats() const noexcept {
-  LoopStats stats = impl_->schedule.counts;
-  stats.missed = impl_->n_missed, stats.notes = impl_->n_note, stats.delay = impl_->schedule.delay();
-  return stats;
-}
 
 void ChunkLoop::reset() noexcept {
   Impl& loop = *impl_;

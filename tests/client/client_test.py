@@ -238,6 +238,31 @@ def test_a_server_that_comes_back_with_another_policy_is_an_error_of_a_loop(faul
                 loop.pace()
 
 
+def test_a_loop_tells_a_server_that_lists_it_who_drives_and_what_it_counts(faulty):
+    def greet(*features):
+        reply = wire.MESSAGES["HelloReply"](min_version=1, max_version=1, features=features)
+        faulty.on_hello = lambda request: [response(request, hello=reply)]
+
+    greet("leftover", "loop")
+    options = dict(rate_hz=20, replan_every=1, mode="sync", blend="replace", on_late="hold", on_note="raise", max_jump=0.5)
+    with vla_cpp.Client(faulty.address, timeout=2) as client, ChunkLoop(client, **options, clock=lambda: 0.0) as loop:
+        for seed in (1, 3, 3):
+            loop.step({**OBSERVATION, "seed": seed})
+        loop.take_over("ana")
+        loop.step(OBSERVATION, human=[0, 0])
+        loop.step(OBSERVATION)
+        told = [request.act.loop for request in faulty.acts]
+        assert [(state.driver, state.actions, state.human, state.limited) for state in told] == [(1, 0, 0, 0), (1, 1, 0, 0), (1, 2, 0, 1), (2, 3, 0, 2), (2, 3, 1, 2)]
+        assert client.features == {"leftover", "loop"}
+        greet("leftover")  # one that is older takes its place
+        client._drop(vla_cpp.Disconnected(faulty.address, "", "the server was started anew"))
+        assert client.features == frozenset()
+        loop.give_back("ana")
+        loop.step(OBSERVATION)
+        loop.step(OBSERVATION)
+        assert not any(request.act.HasField("loop") for request in faulty.acts[-2:])
+
+
 def test_a_server_that_comes_back_on_another_device_is_the_same_policy(faulty, client):
     client.act(**OBSERVATION)
     faulty.description.runtime.device, faulty.description.bundle.name = "cuda:0", "moved.gguf"

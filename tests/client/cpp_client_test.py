@@ -166,6 +166,17 @@ def test_a_server_that_goes_away_in_motion(faulty, tmp_path):
     assert found["allocations"] == 0
 
 
+def test_a_loop_tells_a_server_that_lists_it_who_drives_and_what_it_counts(faulty, tmp_path):
+    given = dict(rate_hz=20.0, replan_every=1, seconds=0.5, timeout=5)
+    in_cpp("drive", tmp_path, faulty.address, {}, {}, "go", **given)
+    assert faulty.acts and not any(request.act.HasField("loop") for request in faulty.acts)
+    faulty.acts.clear()
+    faulty.on_hello = lambda request: [response(request, hello=wire.MESSAGES["HelloReply"](min_version=1, max_version=1, features=["loop"]))]
+    in_cpp("drive", tmp_path, faulty.address, {}, {}, "go", **given)
+    told = [request.act.loop for request in faulty.acts]
+    assert told[0].actions == 0 and told[-1].actions + told[-1].missed > 5 and all(state.driver == 1 for state in told)
+
+
 def test_a_loop_outlives_its_server(tmp_path):
     """The process is killed, and another one takes its address."""
     case = Golden("two_views")

@@ -20,6 +20,7 @@ from golden_cases import Golden, tensors
 from server_process import SECONDS, VLA, frames
 
 import vla_cpp
+from vla_cpp.control import ChunkLoop
 from vla_cpp.recording import Recording, acts_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -252,6 +253,34 @@ def test_a_refusal_is_told(watched):
     assert act["code"] == "bad_observation" and act["error"]["where"] == "instruction" and "chunk" not in act
 
 
+def drive(watched):
+    """A loop that asks three times: before a command, before one that is cut, and while a person drives. The first chunk."""
+    observation = dict(images={**watched.sent, **watched.files}, state=watched.case.state, text="open the drawer", seed=1)
+    options = dict(replan_every=1, mode="sync", blend="linear", fade_steps=1, on_late="hold", on_note="ignore", max_jump=1e-6)
+    with ChunkLoop(watched.robot, rate_hz=1000, allow_other_rate=True, **options, clock=lambda: 0.0) as loop:
+        chunk = loop.step(observation).chunk
+        assert loop.step(observation).limited
+        loop.take_over("ana")
+        loop.step(observation, human=chunk[0])
+    watched.n_act += 3
+    return chunk
+
+
+def test_the_state_of_a_loop_is_told_and_recorded_and_changes_no_answer(case, tmp_path):
+    watched = Watched(case, "--record", tmp_path / "r")
+    chunk = watched.act()
+    assert np.array_equal(drive(watched), chunk)
+    alone, *told = [act.get("loop") for act in watched.acts()["acts"]]
+    assert alone is None
+    nothing = dict.fromkeys(("actions", "human", "held", "missed", "limited", "refused"), 0)
+    assert told == [
+        {**nothing, "driver": "POLICY"}, {**nothing, "driver": "POLICY", "actions": 1}, {**nothing, "driver": "PERSON", "actions": 2, "limited": 1},
+    ]  # fmt: skip
+    assert watched.stop() == 0
+    again = subprocess.run([VLA, "replay", tmp_path / "r", "--bundle", case.bundle], capture_output=True, text=True)
+    assert again.returncode == 0, again.stdout + again.stderr
+
+
 def test_old_acts_go_and_a_viewer_that_was_away_gets_the_newest(case):
     watched = Watched(case)
     size = 3 * 2048 * 2048
@@ -333,6 +362,28 @@ def test_a_browser_shows_what_happens_and_can_step_back(watched, browser):
         thread.join()
     assert not faults
     page.close()
+
+
+def test_a_browser_shows_who_drives_and_what_a_loop_cuts(case, browser):
+    watched = Watched(case)
+    faults = []
+    page = browser.new_page()
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    try:
+        watched.act()
+        page.goto(watched.url)
+        wait_for(page, "document.getElementById('text').textContent !== ''")
+        assert not page.is_visible("#loop")
+        drive(watched)
+        wait_for(page, "document.getElementById('driver').textContent === 'A person drives'")
+        assert page.get_attribute("#driver", "class") == "note"
+        assert page.locator("#counts .far").all_inner_texts() == ["limited\t1"]
+        page.click("#before")
+        assert page.inner_text("#driver") == "The policy drives" and not page.locator("#counts .far").count()
+        assert not faults
+    finally:
+        page.close()
+        assert watched.stop() == 0
 
 
 def test_a_browser_switches_to_what_the_policy_sees_and_records(case, browser, tmp_path):

@@ -64,7 +64,7 @@ class ScriptedPolicy : public Policy {
   }
 
   const Spec& spec() const override { return spec_; }
-  void submit(const Observation&, const Leftover* leftover) noexcept override {
+  void submit(const Observation& observation, const Leftover* leftover) noexcept override {
     const Json& script = answers_[n_asked_++ % answers_.size()];
     due_ = now + script["seconds"].get<double>();
     answer_ = {.horizon = spec_.horizon, .d_action = spec_.d_action};
@@ -73,10 +73,19 @@ class ScriptedPolicy : public Policy {
     answer_.n_note = script["notes"];
     const std::string code = script["error"];
     code.copy(answer_.problem.code, sizeof answer_.problem.code - 1);
+    const LoopStats& loop = *observation.loop;
+    asked.push_back({{"loop",
+                      {{"driver", loop.is_driven ? "PERSON" : "POLICY"},
+                       {"actions", loop.actions},
+                       {"human", loop.human},
+                       {"held", loop.held},
+                       {"missed", loop.missed},
+                       {"limited", loop.limited},
+                       {"refused", loop.refused}}},
+                     {"leftover", nullptr}});
     if (leftover != nullptr)
-      asked.push_back({{"rows", bits(leftover->rows)}, {"delay", leftover->delay}, {"schedule", leftover->schedule}});
-    else
-      asked.push_back(nullptr);
+      asked.back()["leftover"] = {
+          {"rows", bits(leftover->rows)}, {"delay", leftover->delay}, {"schedule", leftover->schedule}};
     is_under_way_ = true;
   }
   bool is_reading() const noexcept override { return false; }

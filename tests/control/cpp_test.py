@@ -71,10 +71,12 @@ class ScriptedPolicy:
             n_action_steps=given["n_action_steps"],
         )  # fmt: skip
 
-    def submit(self, leftover=None, **_):
+    features = ("loop",)
+
+    def submit(self, loop, leftover=None):
         script = self.answers[len(self.asked) % len(self.answers)]
         told = leftover and {"rows": bits(leftover.rows), "delay": leftover.delay, "schedule": leftover.schedule}
-        self.asked.append(told)
+        self.asked.append({"loop": loop, "leftover": told})
         return Pending(self, script)
 
 
@@ -192,7 +194,7 @@ def test_both_loops_give_the_same_bytes():
         assert expected == found, f"scenario {seed}"
         seen |= {action["state"] for action in found["actions"]} | {"clamped" for action in found["actions"] if action.get("clamped")}
         seen |= {"human" for action in found["actions"] if action.get("human") and action["policy"]}
-        seen |= {"leftover" for asked in found["asked"] if asked}
+        seen |= {"leftover" for asked in found["asked"] if asked["leftover"]}
     assert seen == {"command", "held", "none", "stopped", "failed", "clamped", "leftover", "human"}  # the scenarios reach every state
 
 

@@ -257,9 +257,16 @@ class ChunkLoop:
             if self._worker:
                 self._handle = self._worker.submit(self._policy.act, **_snapshot(arguments))
             else:
-                self._handle = self._policy.submit(**arguments)
+                told = {"loop": self._state()} if "loop" in getattr(self._policy, "features", ()) else {}
+                self._handle = self._policy.submit(**arguments, **told)
         except VlaError as error:
             self._fail(error)
+
+    def _state(self) -> Dict[str, Any]:
+        """What a server's page shows of the loop."""
+        stats = self.stats
+        counts = {name: stats[name] for name in ("actions", "human", "held", "missed", "limited", "refused")}
+        return {"driver": "POLICY" if self.driver is None else "PERSON", **counts}
 
     def _wait(self) -> None:
         if self._handle is not None:
