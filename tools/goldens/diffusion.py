@@ -15,7 +15,7 @@ from . import act
 from . import lerobot_layout as layout
 from .act import camera_statistics, write
 from .cases import Case
-from .draw import bfloat16, f32
+from .draw import f32
 from .parameters import linear, norm, parameter, statistics
 from .recorder import Taps
 
@@ -215,13 +215,11 @@ CASES = {
         {}, d_state=2, d_action=2, d_environment=16)),
 }
 
-
 # --- the reference ---------------------------------------------------------------------------------------------------
 
 
-def load(checkpoint, dtype="float32"):
-    """(policy, preprocessor, postprocessor); published: products in bfloat16 as torch.autocast makes them."""
-    import torch
+def opened(checkpoint):
+    """(policy, preprocessor, postprocessor) as LeRobot gives them."""
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
     from lerobot.policies.factory import make_pre_post_processors
@@ -229,11 +227,18 @@ def load(checkpoint, dtype="float32"):
     folder = str(checkpoint)
     config = PreTrainedConfig.from_pretrained(folder)
     policy = DiffusionPolicy.from_pretrained(folder, config=config, strict=not act.is_old(checkpoint)).float().eval()
+    return policy, *(act.migrated(policy, checkpoint) if act.is_old(checkpoint) else make_pre_post_processors(config, pretrained_path=folder))
+
+
+def load(checkpoint, dtype="float32"):
+    """(policy, preprocessor of a case, postprocessor); published: products in bfloat16 as torch.autocast makes them."""
+    import torch
+
+    policy, before, after = opened(checkpoint)
     if dtype == "published":
         policy.predict_action_chunk = torch.autocast("cpu", torch.bfloat16)(policy.predict_action_chunk)
     policy.predict_action_chunk = functools.partial(chunk_of, policy, policy.predict_action_chunk)
-    before, after = act.migrated(policy, checkpoint) if act.is_old(checkpoint) else make_pre_post_processors(config, pretrained_path=folder)
-    return policy, lambda batch: Moments(config, before).of(batch), after
+    return policy, lambda batch: Moments(policy.config, before).of(batch), after
 
 
 def chunk_of(policy, predict, batch, noise):
