@@ -24,7 +24,7 @@ VIEWS = {"top": (33, 40), "wrist": (20, 24)}
 SMALL = xvla.Checkpoint(
     xvla.vision((8, 12), (1, 1), (2, 3), (2, 4), 2, 8),
     xvla.text(8, 1, 2, 12),
-    xvla.policy(3, 2, 12, 1, 2, resize_imgs_with_padding=(16, 24), max_state_dim=20, tokenizer_max_length=7, normalization_mapping=xvla.MODES),
+    xvla.policy(3, 2, 12, 1, 2, resize_imgs_with_padding=(16, 24), max_state_dim=20, tokenizer_max_length=7, normalization_mapping=xvla.MAPPING),
     VIEWS,
     d_state=20,
     domain=1,

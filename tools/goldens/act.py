@@ -5,6 +5,7 @@
 The towers are torchvision's own ResNet-18 and -34, which have one width only: frames are small, so that what they give is.
 """
 
+import random
 import zlib
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from . import lerobot_layout as layout
-from .cases import Case
+from .cases import MODES, Case
 from .draw import Generator, bfloat16, f32
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import linear, norm, parameter, statistics
@@ -227,6 +228,33 @@ CASES = {
         policy(4, 20, 1, 28, (1, 1, 1), temporal_ensemble_coeff=0.01, n_action_steps=1), {"image": (25, 50)}, d_state=2, d_action=2,
         old=True, zero_spread=(1,))),
 }
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case from the seed: towers have one width, everything else is drawn; in one of ten a width that positions cannot be told in."""
+    r = random.Random(f"act {seed}")
+    heads = r.choice((1, 2, 3, 4, 5))
+    d_model = 4 * heads * r.choice((1, 2, 3, 5)) if r.random() < 0.9 else 2 * heads * r.choice((3, 5, 7))
+    height, width = r.randint(12, 80), r.randint(12, 80)
+    frames = {f"cam{i}": (height, width, r.choice(("png", "png", "jpg"))) for i in range(r.randint(1, 3))}
+    old, n_environment = r.random() < 0.2, r.choice((0, 0, 0, 1, 9))
+    pixels = ("MEAN_STD",) if old else ("MEAN_STD", "MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY")
+    states = ("MEAN_STD", "IDENTITY") if old else MODES
+    modes = {"VISUAL": r.choice(pixels), "STATE": r.choice(states), "ACTION": r.choice(states)}
+    if r.random() < 0.5:
+        modes["ENV"] = r.choice(states)
+    settings = policy(
+        r.randint(1, 14), d_model, heads, r.choice((20, 50, 72)), (r.randint(1, 4), r.choice((1, 1, 2, 3)), r.randint(1, 2)),
+        vision_backbone=r.choice(("resnet18", "resnet18", "resnet34")), pre_norm=r.random() < 0.4, use_vae=r.random() < 0.7,
+        feedforward_activation=r.choice(("relu", "relu", "gelu")), latent_dim=r.choice((8, 32)), normalization_mapping=modes)
+    checkpoint = Checkpoint(settings, {view: frame[:2] for view, frame in frames.items()}, r.randint(1, 20), r.randint(1, 20), n_environment,
+                            exact=False, imagenet=r.random() < 0.5, dtype=r.choice(("F32", "F32", "BF16")), old=old)
+    return case(seed, frames, checkpoint)
+
+
+DRAWN = {"act": draw}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ chosen so that every code is far from where it changes: `Recorder` asserts it.
 
 import importlib.machinery
 import os
+import random
 import sys
 import types
 from dataclasses import dataclass, field
@@ -139,6 +140,29 @@ CASES = {
     "bitvla/one_view": case(14, ("wrist",), "open the middle drawer, then 1024 times 12345", ONE_VIEW, views=["wrist"]),
     "bitvla/two_layers": case(18, ("image", "image2"), "fold the towel", TWO_LAYERS),
 }
+
+# --- random configurations ------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """(case, spelling of the model's type): micro and tiny sizes, one view or two, files of one process and of several."""
+    r = random.Random(seed)
+
+    def tower(n_head, d_head, **others):
+        return sizes(n_head * d_head, 4 * r.choice((6, 7, 12, 17, 68, 92)), r.randint(1, 3), n_head, **others)
+
+    vision = tower(r.choice((1, 2, 3, 6)), r.choice((4, 8, 12, 24)), image_size=14 * r.choice((1, 2, 3, 4)))
+    kv = r.choice((1, 2, 3))
+    text = tower(kv * r.choice((1, 2, 4)), r.choice((4, 8, 16)), num_key_value_heads=kv)
+    prefixes = tuple(r.choice(("", "module.")) for _ in range(2))
+    checkpoint = Checkpoint(vision, text, n_shard=r.choice((1, 2, 3)), prefixes=prefixes)
+    cameras = r.choice((("image", "image2"), ("wrist",)))
+    options = {} if len(cameras) == 2 else {"views": list(cameras)}
+    words = r.choice(("open the drawer", "Put the WHITE mug on the plate", "don't 12345 stop!", "naïve café 漢字", "a", "word " * 20))
+    return case(seed, cameras, words, checkpoint, **options), r.choice(("bitvla", "openvla"))
+
+
+DRAWN = {"bitvla": draw}
 
 
 # --- the reference --------------------------------------------------------------------------------------------------

@@ -18,6 +18,10 @@ RECORDED = ROOT / "tests/golden"  # what is kept: observations, noise and the re
 # An observation of LIBERO, for cases of the published size.
 LIBERO_FRAMES = {view: (256, 256, "png") for view in ("image", "wrist_image")}
 LIBERO_INSTRUCTION = "pick up the black bowl between the plate and the ramekin and place it on the plate"
+# Of random configurations: what a feature is normalized by, instructions.
+MODES = ("MEAN_STD", "MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY")
+TEXTS = ("a", "pick up the red cube\n", "  two  spaces ", "don't 12345 stop!", "naïve café 漢字 🙂 ok", "word " * 40, "\n\n",
+         "<image> <|im_end|> hi", "tab\tand\r\nline")
 
 
 @dataclass(frozen=True)
@@ -110,3 +114,12 @@ def write_checkpoint(case, folder):
     if case.options:
         write_json(folder / "convert.json", case.options)
     return case.checkpoint.write(case.seed, folder / "checkpoint")
+
+
+def draw_views(r, n_empty):
+    """({view: declared size}, {view: frame or None}) with at most as many absent as the reference fills in."""
+    frames = {f"cam{i}": (r.randint(12, 90), r.randint(12, 90), r.choice(("png", "png", "jpg"))) for i in range(r.randint(1, 3))}
+    views = {view: frame[:2] for view, frame in frames.items()}
+    if n_empty and len(frames) > 1 and r.random() < 0.7:
+        frames[r.choice(list(frames))] = None
+    return views, frames | {f"empty_camera_{i}": None for i in range(n_empty)}

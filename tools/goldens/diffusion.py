@@ -6,6 +6,7 @@ The towers are torchvision's own ResNet-18 and -34, which have one width only: f
 """
 
 import functools
+import random
 import zlib
 from dataclasses import dataclass, field
 
@@ -14,7 +15,7 @@ import numpy as np
 from . import act
 from . import lerobot_layout as layout
 from .act import camera_statistics, write
-from .cases import Case
+from .cases import MODES, Case
 from .draw import f32
 from .parameters import linear, norm, parameter, statistics
 from .recorder import Taps
@@ -214,6 +215,49 @@ CASES = {
               normalization_mapping={"VISUAL": "MEAN_STD", "STATE": "MIN_MAX", "ENV": "MEAN_STD", "ACTION": "MIN_MAX"}),
         {}, d_state=2, d_action=2, d_environment=16)),
 }
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case from the seed: scheduler, moments, cameras or none, norms, sizes of the U-Net; in one of ten a config that the reference
+    refuses or cannot run."""
+    r = random.Random(f"diffusion {seed}")
+    levels, groups = r.randint(1, 4), r.choice((1, 2, 4, 8))
+    widths = [8 * r.randint(1, 4) if i == 0 or groups == 8 else groups * r.randint(1, 10) for i in range(levels)]
+    horizon = max(4, 2**levels * r.randint(1, 3))  # a norm of two values is their order
+    moments = min(r.choice((1, 2, 2, 3, 4)), horizon)
+    height, width = r.randint(20, 80), r.randint(20, 80)
+    cameras, n_environment = {f"cam{i}": (height, width) for i in range(r.choice((0, 1, 1, 2, 3)))}, r.choice((0, 0, 1, 9))
+    n_environment = n_environment or (0 if cameras else 5)
+    n_train = r.choice((5, 20, 50, 100))
+    scheduler = r.choice(("DDPM", "DDPM", "DDIM"))
+    sized = {}
+    if cameras and r.random() < 0.4:
+        sized = {"resize_shape": [r.randint(20, 70), r.randint(20, 70)], "crop_ratio": r.choice((1.0, 0.9, 0.76, 0.5))}
+    elif r.random() < 0.5:
+        sized = {"crop_shape": [r.randint(12, height), r.randint(12, width)]}
+    old = bool(cameras) and not n_environment and r.random() < 0.2
+    states = ("MEAN_STD", "MIN_MAX") if old else MODES
+    modes = {"VISUAL": r.choice(("MEAN_STD",) if old else ("MEAN_STD", "MEAN_STD", "MIN_MAX", "QUANTILES", "IDENTITY")),
+             "STATE": r.choice(states), "ACTION": r.choice(states)}
+    if n_environment:
+        modes["ENV"] = r.choice(MODES)
+    policy = sizes(
+        horizon, r.randint(1, horizon - moments + 1), widths, 2 * r.randint(2, 9), groups, r.randint(1, 9), n_obs_steps=moments,
+        kernel_size=r.choice((1, 3, 5, 5, 7)), use_film_scale_modulation=r.random() < 0.6, use_group_norm=r.random() < 0.5,
+        use_separate_rgb_encoder_per_camera=r.random() < 0.5, vision_backbone=r.choice(("resnet18", "resnet18", "resnet34")),
+        noise_scheduler_type=scheduler, num_train_timesteps=n_train, num_inference_steps=r.choice((None, r.randint(1, n_train))),
+        beta_schedule=r.choice(("squaredcos_cap_v2", "squaredcos_cap_v2", "linear", "scaled_linear", "sigmoid")),
+        beta_start=r.choice((0.0001, 0.001)), beta_end=r.choice((0.02, 0.05)), prediction_type=r.choice(("epsilon", "epsilon", "sample")),
+        clip_sample=r.random() < 0.7, clip_sample_range=r.choice((1.0, 0.5, 3.0)), normalization_mapping=modes, **sized)
+    checkpoint = Checkpoint(policy, cameras, r.randint(1, 12), r.randint(1, 12), n_environment, exact=False,
+                            dtype=r.choice(("F32", "F32", "BF16")), old=old)
+    return case(seed, (r.choice(("png", "png", "jpg")),), checkpoint)
+
+
+DRAWN = {"diffusion": draw}
+
 
 # --- the reference ---------------------------------------------------------------------------------------------------
 

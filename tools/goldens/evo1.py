@@ -7,12 +7,13 @@ reference.  `lerobot`: the hub layout, with LeRobot's own class.  `vlm/` is what
 weights.  Layer scales are near 1 and not 1.
 """
 
+import random
 from dataclasses import dataclass
 from pathlib import Path
 
 from . import evo1_server
 from . import lerobot_layout as layout
-from .cases import Case, copy_tokenizer
+from .cases import MODES, Case, copy_tokenizer
 from .draw import bfloat16
 from .evo1_server import read_options, towers_from_config
 from .files import bfloat16_bits, write_json, write_stream, write_torch
@@ -302,6 +303,43 @@ CASES = {
                normalization_mapping={"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "QUANTILES"}),
         {"wrist": (56, 56), "base": (80, 43)}, d_state=6, zero_spread=(1,))),
 }
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case whose every size comes from the seed, in either published layout: three slots for views, rows of absent ones and of pads masked or not."""
+    r = random.Random(f"evo1 {seed}")
+    grid, kv, vision_heads = 2 * r.choice((1, 2, 2, 3)), r.choice((1, 2, 3)), r.choice((1, 2, 3, 5))
+    heads = kv * r.choice((1, 2, 3))
+    d_model = heads * r.choice((8, 12, 16))
+    kept, d_state, d_action = r.randint(1, 4), r.randint(1, 24), r.randint(1, 24)
+    vision = tower(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)), layer_norm_eps=r.choice((1e-6, 1e-5)))
+    text = decoder(d_model, kept + r.choice((0, 0, 2)), heads, kv, r.choice((32, 50)), rope_theta=r.choice((1e4, 1e6)), rms_norm_eps=r.choice((1e-6, 1e-5)))
+    last = head(r.randint(1, 3), r.choice([n for n in (1, 2, 3, 4, 6) if d_model % n == 0]), r.choice((20, 44)), r.choice((24, 36)))
+    n_token = 3 * (grid // 2) ** 2 + r.choice((24, 40, 64))
+    views = {f"cam{i}": (r.randint(12, 90), r.randint(12, 90)) for i in range(r.randint(1, 3))}
+    frames = {view: (*size, r.choice(("png", "png", "jpg"))) for view, size in views.items()}
+    if len(frames) > 1 and r.random() < 0.5:
+        frames[r.choice(list(frames))] = None
+    sizes, rest = (14 * grid, vision, text, kept, last), {"d_state": d_state, "d_action": d_action}
+    words = r.choice(("go", "Pick up the red_cube!", "naïve café 漢字 n° 5", "word " * 20))
+    if r.random() < 0.5:
+        n_empty, width = sum(frame is None for frame in frames.values()), r.choice((0, 3))
+        settings = policy(r.randint(1, 12), n_token, d_state + width, d_action + width, num_inference_timesteps=r.choice((1, 4, 10)),
+                          vlm_dtype=r.choice(("float32", "bfloat16")), max_views=3, empty_cameras=n_empty,
+                          normalization_mapping={"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)})
+        frames |= {f"empty_camera_{i}": None for i in range(n_empty)}
+        return Case(seed, frames, words, Checkpoint("lerobot", *sizes, settings, views, **rest))
+    keys, revision = r.choice((("sawyer",), ("aloha_joint", "robotwin_stack"))), r.choice(("r1", "r2"))
+    normalization = r.choice(("bounds", "bounds_q99", "normal")) if len(keys) > 1 and revision == "r2" else "bounds"
+    options = said(revision, r.choice(("zero_attention", "causal_attention")), views)
+    checkpoint = Checkpoint("authors", *sizes, policy(r.randint(1, 12), n_token), views, **rest, normalization=normalization, keys=keys)
+    return Case(seed, frames, words, checkpoint, options=options)
+
+
+DRAWN = {"evo1": draw}
+
 
 # --- the reference ---------------------------------------------------------------------------------------------------
 

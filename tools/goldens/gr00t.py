@@ -8,6 +8,7 @@ case is.
 
 import json
 import math
+import random
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -230,6 +231,48 @@ def published(checkpoint, views, tag, index, vision, text, head, *how, **more):
     robot = Robot(tuple(views), POSE | {"gripper": 2}, POSE | {"gripper": 1}, 16)
     head |= {"max_seq_len": 1024, "max_num_embodiments": 32}
     return checkpoint(tag, index, robot, vision, text, head, *how, **more)
+
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw_robot(arch, r, n_view):
+    widths = {f"k{i}": r.choice((1, 2, 3, 4)) for i in range(r.randint(1, 4))}
+    actions, relative, poses = dict(widths), {}, {}
+    if arch != "gr00t_n1_5":
+        relative = {key: None for key in widths if r.random() < 0.5}
+        if r.random() < 0.4:
+            kind = "XYZ_ROTVEC" if arch == "gr00t_n1_6" else "XYZ_ROT6D"
+            widths["pose"] = actions["pose"] = 6 if kind == "XYZ_ROTVEC" else 9
+            relative["pose"], poses["pose"] = None, kind
+    mixed = arch == "gr00t_n1_6"  # LeRobot's N1.7 does not read these lists, and takes one moment of the state
+    moments = r.choice(((0,), (0,), (-2, 0))) if mixed else (0,)
+    mean_std = tuple(k for k in widths if mixed and k not in poses and r.random() < 0.3)
+    return Robot(tuple(f"cam{i}" for i in range(n_view)), widths, dict(r.sample(sorted(actions.items()), len(actions))), r.randint(1, 6), relative,
+                 poses=poses, mean_std=mean_std, sin_cos=tuple(k for k in widths if mixed and r.random() < 0.2), per_step=r.random() < 0.5,
+                 state_moments=moments)
+
+
+def draw(arch, release, seed, **options):
+    """A case whose every size comes from the seed, of square cameras: aspects are checked elsewhere. release: draws what a release has of its own."""
+    r = random.Random(f"{arch} {seed}")
+    heads, kv, d_head = r.choice(((4, 2, 8), (3, 1, 12), (6, 3, 8), (5, 5, 8), (2, 2, 16)))
+    vl_heads = r.choice((2, 3, 4))
+    d_model, n_view = vl_heads * 2 * r.choice((4, 5, 6)), r.randint(1, 3)
+    robot = draw_robot(arch, r, n_view)
+    every, steps = r.choice((1, 2, 2, 3)), r.choice((1, 2, 4, 5))
+    vl = None if arch == "gr00t_n1_6" else (r.choice((1, 2, 3)), vl_heads, d_model // vl_heads)
+    more = {} if arch == "gr00t_n1_5" else {"attend_text_every_n_blocks": every}
+    kept, vision_heads = r.choice((4, 5)), r.choice((1, 2, 3))
+    sizes = head(kept, (r.randint(2, 7), r.choice((2, 3, 4)), 2 * r.choice((3, 4, 5))), vl, 2 * r.randint(4, 12),
+                 2 * sum(robot.states.values()) + r.randint(0, 3), sum(robot.actions.values()) + r.randint(0, 3), robot.rows + r.randint(0, 3),
+                 num_inference_timesteps=steps, **more)
+    side, crop, camera = 8 * r.choice((2, 3, 4)), r.choice((0.8, 0.9, 0.95)), r.randint(12, 70)
+    tower = vision_heads * 4 * r.choice((2, 3, 4)), r.randint(3, 5), vision_heads, 2 * r.randint(8, 20)
+    text_sizes = d_model, kept + r.randint(0, 2), heads, kv, d_head, r.choice((32, 50))
+    checkpoint = release(r, robot, tower, text_sizes, sizes, side, crop, camera)
+    frames = {view: (camera, camera, r.choice(("png", "png", "jpg"))) for view in robot.views}
+    return case(seed, frames, r.choice(("go", "Pick up the red cube!", "naïve café 漢字 n° 5", "word " * 20)), checkpoint, options=options)
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

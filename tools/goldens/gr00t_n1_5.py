@@ -7,6 +7,7 @@ that it shares with N1.5, by the authors' names of tensors; the future tokens an
 torchvision in float32 and numbers normalized as the authors' transforms do it.
 """
 
+import functools
 import json
 import types
 from dataclasses import dataclass
@@ -151,6 +152,18 @@ def published(views, arch="gr00t_n1_5"):
     return gr00t.published(
         Checkpoint, views, "my_arm", INDEX, vision(1152, 27, 16, 4304, 224), text(2048, 28, 16, 8, 128, 6144) | {"vocab_size": 151680},
         head(12, (16, 32, 48), (4, 32, 64), 1024, 64, 32, 16), camera(width, height), n_future=32)
+
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw_release(r, robot, tower, text_sizes, head, side, crop, size):
+    parts = vision(*tower, 14 * r.choice((1, 2, 3)), r.choice((7, 14))), text(*text_sizes)
+    how = {key: r.choice(("min_max", "q99", "mean_std", None)) for key in robot.states}
+    return Checkpoint("robot", 1, robot, *parts, head, camera(size, size, how, how, crop), n_future=r.randint(1, 6))
+
+
+DRAWN = {"gr00t_n1_5": functools.partial(gr00t.draw, "gr00t_n1_5", draw_release, variant="data_config.json")}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ LeRobot's N1.7 without its self-attention over the features, by the authors' nam
 authors' transform and Pillow; numbers are normalized as the authors' processor does it, in double precision.
 """
 
+import functools
 import json
 import re
 import types
@@ -147,6 +148,18 @@ def published(views, arch="gr00t_n1_6"):
     return gr00t.published(
         Checkpoint, views, "libero_panda", 2, vision(1152, 27, 16, 4304, 16, 14), text(2048, 28, 16, 8, 128, 6144) | {"vocab_size": 151680},
         head(16, (32, 32, 48), None, 1024, 128, 128, 50), {"shortest_image_edge": 256, "crop_fraction": 0.95})
+
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw_release(r, robot, tower, text_sizes, head, side, crop, camera):
+    parts = vision(*tower, r.randint(3, 9)), text(*text_sizes)
+    image = {"shortest_image_edge": side + r.randint(-3, 3), "crop_fraction": crop}
+    return Checkpoint("robot", 1, robot, *parts, head, image, percentiles=r.random() < 0.5)
+
+
+DRAWN = {"gr00t_n1_6": functools.partial(gr00t.draw, "gr00t_n1_6", draw_release)}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ simulator's sign: the authors' server does not, and so nothing is done to it her
 """
 
 import contextlib
+import functools
 import json
 import types
 from dataclasses import dataclass
@@ -170,6 +171,20 @@ def published(views, arch="gr00t_n1_7"):
         Checkpoint, views, "libero_sim", 2, vision(1024, 24, 16, 4096, 48, (5, 11, 17), 16),
         text(2048, 28, 16, 8, 128, 6144, (24, 20, 20)) | {"vocab_size": 151936}, head(16, (32, 32, 48), (4, 32, 64), 1024, 132, 132, 40),
         {"image_target_size": [256, 256], "shortest_image_edge": 256, "crop_fraction": 0.95}, 256)
+
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw_release(r, robot, tower, text_sizes, head, side, crop, camera):
+    sections = {8: (2, 1, 1), 12: (2, 2, 2), 16: (4, 2, 2)}[text_sizes[4]]
+    deepstack = sorted(r.sample(range(tower[1]), 3))
+    parts = vision(*tower, r.randint(3, 7), deepstack), text(*text_sizes, sections)
+    image = {"image_target_size": [side] * 2, "shortest_image_edge": side, "crop_fraction": crop}
+    return Checkpoint("robot", 1, robot, *parts, head, image, side, percentiles=r.random() < 0.5)
+
+
+DRAWN = {"gr00t_n1_7": functools.partial(gr00t.draw, "gr00t_n1_7", draw_release)}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

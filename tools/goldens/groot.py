@@ -8,8 +8,10 @@ States and actions are one vector each, normalized by the statistics of a data s
 """
 
 import contextlib
+import functools
 import importlib.metadata
 import json
+import random
 import shutil
 import tempfile
 import types
@@ -21,7 +23,7 @@ import numpy as np
 
 from . import gr00t, gr00t_n1_5, gr00t_n1_7
 from . import lerobot_layout as layout
-from .cases import Case, backbone_folder
+from .cases import TEXTS, Case, backbone_folder
 from .draw import bfloat16
 from .files import bfloat16_bits, write_json, write_safetensors, write_stream
 from .gr00t import Robot, head
@@ -248,6 +250,9 @@ CASES = {
 }
 
 
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
 def draw_n1_5(r, sizes, d_state, d_action, tower, text_sizes, head, more):
     vision = gr00t_n1_5.vision(*tower, 14 * r.choice((1, 2, 3)), r.choice((7, 14)))
     return n1_5(sizes, d_state, d_action, vision, text(*text_sizes), head, n_future=r.randint(1, 6), **more)
@@ -278,7 +283,29 @@ def draw_n1_7_keys(r, sizes, d_state, d_action, tower, text_sizes, head, more):
     return n1_7_keys(drawn.sizes, robot, drawn.base.vision, drawn.base.text, drawn.base.head, drawn.base.side, **more)
 
 
-DRAWN = {"n1_5": draw_n1_5, "n1_7": draw_n1_7, "n1_7_keys": draw_n1_7_keys}  # release -> what a random configuration has of its own
+RELEASES = {"n1_5": draw_n1_5, "n1_7": draw_n1_7, "n1_7_keys": draw_n1_7_keys}  # release -> what a random configuration has of its own
+
+
+def draw(release, seed):
+    """A case whose every size comes from the seed, by the statistics of a data set; frames are squeezed, and texts printed as a list."""
+    r = random.Random(f"groot {release} {seed}")
+    heads, kv, d_head = r.choice(((4, 2, 8), (3, 1, 12), (6, 3, 8), (5, 5, 8), (2, 2, 16)))
+    vl_heads = r.choice((2, 3, 4))
+    d_model, kept, vision_heads = vl_heads * 2 * r.choice((4, 5, 6)), r.choice((4, 5)), r.choice((1, 2, 3))
+    d_state, d_action, size = r.randint(1, 14), r.randint(1, 14), (r.randint(12, 90), r.randint(12, 90))
+    sizes = {view: size for view in r.sample(("front", "wrist", "cam_high", "Top", "hand", "left_wrist"), r.randint(1, 3))}
+    vl = r.choice((1, 2, 3)), vl_heads, d_model // vl_heads
+    last = head(kept, (r.randint(2, 7), r.choice((2, 3, 4)), 2 * r.choice((3, 4, 5))), vl, 2 * r.randint(4, 12), d_state + r.randint(0, 4),
+                d_action + r.randint(0, 4), r.randint(1, 9), num_inference_timesteps=r.choice((1, 2, 4, 5)))
+    tower = vision_heads * 4 * r.choice((2, 3, 4)), r.randint(3, 5), vision_heads, 2 * r.randint(8, 20)
+    text_sizes = d_model, kept + r.randint(0, 2), heads, kv, d_head, r.choice((32, 50))
+    more = {"zero_spread": (0,) if r.random() < 0.3 else (), "stored_head": r.random() < 0.5}
+    drawn = RELEASES[release](r, sizes, d_state, d_action, tower, text_sizes, last, more)
+    words = r.choice((*TEXTS, "the robot's \"cup\" \\ here", 'a "cup"', "a\u200bb\x7f\u00ad", "", "word " * 20))
+    return Case(seed, frames(drawn.sizes, r.choice(("png", "png", "jpg"))), words, drawn, options=OPTIONS)
+
+
+DRAWN = {f"groot_{release}": functools.partial(draw, release) for release in RELEASES}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import functools
 import importlib.machinery
 import json
 import os
+import random
 import sys
 import types
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .cases import Case, copy_tokenizer
+from .cases import TEXTS, Case, copy_tokenizer
 from .draw import f32
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import decoder, decoder_layer, linear, norm, parameter, rms_norm
@@ -187,6 +188,29 @@ CASES = {
         Tower(48, 2, 60), Tower(32, 2, 36), decoder(40, 2, 5, 5, 28, rms_norm_eps=1e-5, rope_theta=5000.0), side=42, d_action=4, n_bin=64, n_shard=3,
         own_statistics=True, unmasked=None)),
 }
+
+# --- random configurations ------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case from the seed: widths of both towers, sides, heads that share keys, bins, numbers of an action, statistics, shards."""
+    global MARGIN
+    r, MARGIN = random.Random(f"openvla {seed}"), 0.0  # tokens that rounding changes would show
+    kv, d_head = r.choice((1, 2, 3)), r.choice((4, 6, 8, 16))
+    heads = kv * r.choice((1, 2, 3))
+    towers = [Tower(16 * r.choice((1, 2, 3, 4)), r.randint(2, 5), r.randint(10, 70)) for _ in range(2)]
+    text = decoder(heads * d_head, r.randint(1, 4), heads, kv, r.choice((20, 36, 50)), rms_norm_eps=r.choice((1e-6, 1e-5)),
+                   rope_theta=r.choice((10000.0, 500.0)))
+    d_action = r.randint(1, 9)
+    unmasked = r.choice((None, (), (d_action - 1,), tuple(i for i in range(d_action) if r.random() < 0.4)))
+    others = r.choice(((), ("fractal20220817_data", "taco_play")))
+    checkpoint = Checkpoint(*towers, text, 14 * r.choice((1, 2, 2, 3)), d_action, r.choice((256, 256, 17, 100)), r.choice((1, 1, 3)),
+                            r.random() < 0.3, others, unmasked)
+    frame = r.randint(10, 90), r.randint(10, 90), r.choice(("png", "png", "jpg"))
+    return case(seed, frame, r.choice((*TEXTS, "", "Pick UP the <s> cube</s> \u2581", "<PAD>")), checkpoint, **({"stats": "bridge_orig"} if others else {}))
+
+
+DRAWN = {"openvla": draw}
 
 
 # --- the reference --------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ loaders round to bfloat16 is rounded, and then computed in float32.
 import importlib
 import inspect
 import json
+import random
 import re
 import sys
 import types
@@ -24,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from . import openvla
-from .cases import Case
+from .cases import TEXTS, Case
 from .draw import bfloat16, f32
 from .files import bfloat16_bits, state_dict, write_archive, write_json
 from .openvla import DINO, SIGLIP, Tower, read_options
@@ -168,6 +169,34 @@ CASES = {
     "openvla_oft/diffusion": case(74, {"image": (32, 32, "png"), "image2": (32, 32, "png")}, "pick up the block", Checkpoint(
         Tower(16, 2, 24), Tower(16, 3, 20), decoder(32, 2, 4, 4, 40), d_action=7, d_state=7, platform="bridge", steps=(50, 4))),
 }
+
+# --- random configurations ------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case from the seed: OpenVLA's sizes, cameras, platforms and others, states, FiLM with LoRA, diffusion, files of one process and of several."""
+    r = random.Random(f"openvla_oft {seed}")
+    kv, d_head = r.choice((1, 2, 3)), r.choice((4, 6, 8, 16))
+    heads = kv * r.choice((1, 2, 3))
+    towers = [Tower(16 * r.choice((1, 2, 3, 4)), r.randint(2, 4), r.randint(10, 70)) for _ in range(2)]
+    text = decoder(heads * d_head, r.randint(1, 4), heads, kv, r.choice((20, 36, 50)), rms_norm_eps=r.choice((1e-6, 1e-5)),
+                   rope_theta=r.choice((10000.0, 500.0)))
+    platform = r.choice((*PLATFORMS, *(f"{r.randint(1, 12)},{norm}" for norm in ("bounds", "bounds_q99"))))
+    known = {"libero": (7, 8), "aloha": (14, 14), "bridge": (7, 7)}
+    d_action, d_state = known.get(platform, (r.randint(1, 9), r.randint(1, 9)))
+    side, views, plain = 14 * r.choice((1, 2, 2, 3)), [f"cam{i}" for i in range(r.randint(1, 3))], platform != "aloha" and r.random() < 0.3
+    train = r.choice((50, 50, 7, 100))
+    checkpoint = Checkpoint(
+        *towers, text, side, d_action, n_shard=r.choice((1, 3)), other_stats=r.choice(((), ("other",))),
+        unmasked=r.choice((None, (), (d_action - 1,), tuple(i for i in range(d_action) if r.random() < 0.4))), d_state=r.choice((d_state, d_state, 0)),
+        platform=platform, rank=r.choice((0, 0, 4, 20, 32)), steps=r.choice(((), (), (train, r.randint(1, min(train, 5))))), prefix=r.choice(("", "module.")))
+    frames = {view: (side, side, "png") if plain else (r.randint(10, 90), r.randint(10, 90), r.choice(("png", "png", "jpg"))) for view in views}
+    options = {"plain_images": True} if plain else {}
+    return case(seed, frames, r.choice((*TEXTS, "", "Pick UP the <s> cube</s> \u2581", "<PAD>")), checkpoint,
+                **options, **({"stats": STATISTICS} if checkpoint.other_stats else {}))
+
+
+DRAWN = {"openvla_oft": draw}
 
 
 # --- the reference --------------------------------------------------------------------------------------------------

@@ -8,14 +8,16 @@ size.  `checkpoint/tokenizer` holds what the hub keeps in google/paligemma-3b-pt
 """
 
 import contextlib
+import functools
 import importlib
 import json
+import random
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import lerobot_layout as layout
-from .cases import RECORDED, Case, copy_tokenizer
+from .cases import MODES, TEXTS, Case, copy_tokenizer, draw_views
 from .draw import bfloat16
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import decoder_layer, linear, parameter, rms_norm, siglip, statistics, tower
@@ -186,6 +188,30 @@ CASES = {
         "pi05", policy(8, 5, 28, (14, 14), 24), tower(32, 3, 4, 40), gemma(32, 4, 4, 1, 8, 56), gemma(32, 4, 4, 1, 8, 40),
         {"top": (40, 60), "left": (28, 28), "right": (28, 28)}, d_state=14, d_action=14)),
 }
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw(arch, seed):
+    """A case whose every size comes from the seed; the patches of their tower have 14 pixels."""
+    r = random.Random(seed)
+    kv, vision_heads, depth, d_head = r.choice((1, 1, 2, 3)), r.choice((1, 2, 3, 5)), r.randint(1, 4), r.choice((4, 8, 12, 16, 32))
+    heads = kv * r.choice((1, 2, 4, 8))
+    n_empty, d_state, d_action = r.choice((0, 0, 1)), r.randint(1, 14), r.randint(1, 14)
+    views, frames = draw_views(r, n_empty)
+    modes = {"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)}
+    settings = policy(
+        r.randint(1, 12), r.choice((1, 2, 5, 10)), 14 * r.choice((1, 2, 2, 3, 4)),
+        (max(d_state, r.choice((8, 16, 32))), max(d_action, r.choice((8, 16, 32)))), r.choice((8, 24, 48, 200)),
+        empty_cameras=n_empty, normalization_mapping=modes, min_period=r.choice((4e-3, 1e-3)), max_period=r.choice((4.0, 2.0)),
+        use_relative_actions=d_state >= d_action and r.random() < 0.3)
+    lm, expert = (gemma(r.choice((16, 24, 36, 40)), depth, heads, kv, d_head, r.choice((32, 50))) for _ in range(2))
+    vision = tower(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)))
+    checkpoint = Checkpoint(arch, settings, vision, lm, expert, views, d_state, d_action)
+    return Case(seed, frames, r.choice(TEXTS), checkpoint)
+
+
+DRAWN = {arch: functools.partial(draw, arch) for arch in ("pi0", "pi05")}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

@@ -7,12 +7,13 @@ actions behind the vocabulary of π0's cases; `checkpoint/action_tokenizer` what
 """
 
 import json
+import random
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import lerobot_layout as layout
 from . import pi
-from .cases import Case
+from .cases import MODES, RECORDED, TEXTS, Case, draw_views
 from .draw import bfloat16, f32
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import decoder_layer, linear, rms_norm, siglip, statistics, tower
@@ -87,7 +88,7 @@ class Fast:
 def write_tokenizer(n_action, n_vocab, folder):
     """That of the other cases of π0 with a token for the end of actions and `n_action` as the last of `n_vocab`, of which FAST's ids are the
     first; "Action" and ":" stay two tokens, as PaliGemma's are."""
-    source = pi.RECORDED / "tokenizers/pi"
+    source = RECORDED / "tokenizers/pi"
     spec = json.loads((source / "tokenizer.json").read_text())
     first = n_vocab - n_action
     spec["model"]["vocab"] |= {STOP: N_TOKEN} | {f"<unused{i}>": i for i in range(N_TOKEN + 1, first)}
@@ -225,6 +226,28 @@ def published(views, arch="pi0_fast"):
     """The published size, 2.9 G parameters, with the small tokenizers: it says actions without a prefix, and does not stop."""
     return Checkpoint({"dtype": "bfloat16", "max_decoding_steps": 64, **FREE}, tower(1152, 27, 16, 4304), gemma(2048, 18, 8, 1, 256, 16384), views,
                       d_state=8, size="full")
+
+# --- random configurations ---------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case whose every size comes from the seed. Random answers begin with no prefix: where one is required both refuse."""
+    r = random.Random(f"pi0_fast {seed}")
+    kv, vision_heads, d_head = r.choice((1, 1, 2, 3)), r.choice((1, 2, 3, 5)), r.choice((4, 8, 12, 16, 32))
+    n_empty, d_state, d_action, n_row = r.choice((0, 0, 1)), r.randint(1, 14), r.randint(1, 14), r.randint(1, 12)
+    views, frames = draw_views(r, n_empty)
+    settings = policy(
+        (n_row + r.choice((0, 0, 3)), n_row), r.choice((1, 2, 5, 20, 40)), 14 * r.choice((1, 2, 2, 3, 4)), r.choice((8, 24, 48, 200)), empty_cameras=n_empty,
+        normalization_mapping={"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)}, fast_skip_tokens=r.choice((0, 1, 9)),
+        validate_action_token_prefix=r.random() < 0.1, use_kv_cache=r.random() < 0.7, use_relative_actions=d_state >= d_action and r.random() < 0.3)
+    lm = pi.gemma(r.choice((16, 24, 36, 40)), r.randint(1, 4), kv * r.choice((1, 2, 4, 8)), kv, d_head, r.choice((32, 50)))
+    vision = pi.tower(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)))
+    low = r.choice((-80, -40, -150))
+    fast = Fast(-2 * low, low, r.choice((10, 5, 12.5)))
+    return Case(seed, frames, r.choice(TEXTS), Checkpoint(settings, vision, lm, views, d_state, d_action, fast))
+
+
+DRAWN = {"pi0_fast": draw}
 
 
 # --- the reference -----------------------------------------------------------------------------------------------------

@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """SmolVLA: golden cases, random checkpoints in LeRobot's layout, and LeRobot's class as the reference."""
 
+import random
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import lerobot_layout as layout
-from .cases import Case, copy_tokenizer
+from .cases import MODES, TEXTS, Case, copy_tokenizer, draw_views
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import decoder, decoder_layer, linear, parameter, rms_norm, siglip, statistics, tower
 from .recorder import ChunkRecorder
@@ -189,6 +190,41 @@ CASES = {
         policy(8, 10, (48, 48), 0.5, num_vlm_layers=3, max_state_dim=8, max_action_dim=8, tokenizer_max_length=64,
                pad_language_to="max_length"), {"camera1": (48, 48)}, d_state=5, d_action=3, zero_spread=(2,))),
 }
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case whose every size comes from the seed."""
+    r = random.Random(seed)
+    factor, patch = r.choice((1, 2, 2, 3)), r.choice((4, 5, 6, 8, 14))
+    grid = factor * r.choice((1, 2, 2, 3))
+    table = grid if r.random() < 0.7 else grid + r.choice((1, 2))
+    vision_heads, kv = r.choice((1, 2, 3, 5)), r.choice((1, 2, 3))
+    heads = kv * r.choice((1, 2, 3))
+    d_model = heads * r.choice((8, 12, 16) if heads % 2 == 0 else (8, 16, 24))
+    n_layer, n_cut = r.choice((1, 2, 3, 4, 6)), r.choice((0, 0, 1))
+    n_expert, every = -1, r.choice((2, 2, 2, 3, 4, 1, 0, -1))
+    if n_layer % 2 == 0 and r.random() < 0.3:
+        n_expert, every = n_layer // 2, n_layer if r.random() < 0.5 else 2
+    width = r.choice((0.5, 0.75, 1.0, 0.25))
+    n_empty, d_state, d_action = r.choice((0, 0, 1)), r.randint(1, 14), r.randint(1, 14)
+    views, frames = draw_views(r, n_empty)
+    settings = policy(
+        r.randint(1, 12), r.choice((1, 2, 5, 10)), (grid * patch, grid * patch), width if d_model * width % 2 == 0 else 1.0,
+        num_vlm_layers=n_layer, num_expert_layers=n_expert, self_attn_every_n_layers=every, empty_cameras=n_empty,
+        max_state_dim=max(d_state, r.choice((8, 16, 32))), max_action_dim=max(d_action, r.choice((8, 16, 32))),
+        tokenizer_max_length=r.choice((8, 24, 48)), pad_language_to=r.choice(("longest", "max_length")),
+        prefix_length=r.choice((-1, 0, 90)), attention_mode=r.choice(("cross_attn",) * 5 + ("self_attn",)),
+        normalization_mapping={"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)},
+        min_period=r.choice((4e-3, 1e-3)), max_period=r.choice((4.0, 2.0)))
+    seen = vision(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)), table * patch, patch)
+    language = text(d_model, n_layer + n_cut, heads, kv, r.choice((4, 6, 8, 16, 32)), r.choice((32, 50)))
+    checkpoint = Checkpoint(seen, language, factor, settings, views, d_state, d_action)
+    return Case(seed, frames, r.choice(TEXTS), checkpoint)
+
+
+DRAWN = {"smolvla": draw}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

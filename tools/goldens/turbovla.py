@@ -6,11 +6,12 @@ A checkpoint holds the configs of both backbones and the tokenizer, which the pa
 `language_encoder/`.  The package is lerobot_policy_turbovla of PyPI.
 """
 
+import random
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import lerobot_layout as layout
-from .cases import LIBERO_FRAMES, LIBERO_INSTRUCTION, Case, copy_tokenizer
+from .cases import LIBERO_FRAMES, LIBERO_INSTRUCTION, MODES, TEXTS, Case, copy_tokenizer
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import linear, norm, parameter, statistics, tower
 from .recorder import Taps
@@ -180,6 +181,31 @@ CASES = {
         normalization_mapping={"VISUAL": "IDENTITY", "STATE": "MIN_MAX", "ACTION": "MIN_MAX"}), {"right": (20, 20), "left": (20, 20)},
         d_state=5, d_action=4, zero_spread=(3,))),
 }
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case whose every size comes from the seed; its instruction may have letters of every kind; in one of ten an image that patches do not fill."""
+    r = random.Random(f"turbovla {seed}")
+    vision_heads, text_heads, heads, patch = r.choice((1, 2, 3)), r.choice((1, 2, 3, 5)), r.choice((1, 2, 3, 5)), r.choice((4, 5, 8, 14))
+    side, n_position = patch * r.randint(1, 5) + (r.random() < 0.1), r.choice((12, 20, 40))
+    frames = {f"cam{i}": (r.randint(12, 90), r.randint(12, 90), r.choice(("png", "png", "jpg"))) for i in range(r.randint(1, 4))}
+    if r.random() < 0.2:
+        frames = {view: (side, side, "png") for view in frames}
+    seen = vision(4 * vision_heads * r.choice((2, 3, 5)), r.randint(1, 4), vision_heads, r.choice((20, 36, 50)), patch, r.choice((0, 1, 4, 4)),
+                  layer_norm_eps=r.choice((1e-5, 1e-6)), rope_theta=r.choice((100.0, 100.0, 37.5, 1e4)))
+    language = text(4 * text_heads * r.choice((1, 2, 3)), r.randint(1, 4), text_heads, r.choice((20, 36, 50)), n_position)
+    settings = policy(
+        r.randint(1, 14), 4 * heads * r.choice((1, 2, 3)), heads, r.choice((20, 50, 72)), (r.randint(1, 4), r.randint(1, 4)), side,
+        max_language_tokens=r.randint(3, n_position), feedforward_activation=r.choice(("relu", "relu", "gelu")),
+        normalization_mapping={"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)})
+    checkpoint = Checkpoint(seen, language, settings, {view: frame[:2] for view, frame in frames.items()}, r.choice((0, 1, 7, 20)), r.randint(1, 20),
+                            dtype=r.choice(("F32", "F32", "BF16")))
+    return Case(seed, frames, r.choice((*TEXTS, "Ouvre le TIROIR à côté de l'évier, 한국어 Ⅷ ﬁn", "[SEP]a[MASK] [cls]")), checkpoint)
+
+
+DRAWN = {"turbovla": draw}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

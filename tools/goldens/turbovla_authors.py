@@ -9,6 +9,7 @@ it reads depends on the transformers beside it (NORMED_UP_TO), so that a case is
 
 import json
 import os
+import random
 import sys
 import types
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from . import lerobot_layout as layout
-from .cases import LIBERO_FRAMES, LIBERO_INSTRUCTION, Case, copy_tokenizer
+from .cases import LIBERO_FRAMES, LIBERO_INSTRUCTION, TEXTS, Case, copy_tokenizer
 from .files import write_json, write_torch
 from .parameters import linear, norm, parameter, statistics
 from .recorder import Taps
@@ -218,6 +219,41 @@ CASES = {
             "padding_length": 19, "sub_sentence_present": False, "zero_padded_tokens": True})),
         options={"vision_tokens": "last_block"}),
 }
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+SENTENCES = ("open the drawer", "open the drawer. put the bowl inside", "close it? now. ", "put the bowl on the plate.", ". ? .", "[SEP] a [PAD] b [CLS]",
+             "word " * 40)
+
+
+def draw(seed):
+    """A case whose every size comes from the seed: sentences, rows of padding, residuals, places."""
+    r = random.Random(f"turbovla_authors {seed}")
+    vision_heads, text_heads, heads, patch = r.choice((1, 2, 3)), r.choice((1, 2, 3, 5)), r.choice((1, 2, 3, 4, 6)), r.choice((4, 5, 8, 14))
+    side, n_position, n_view = patch * r.randint(1, 4), r.choice((20, 40)), r.randint(1, 3)
+    views = [f"cam{i}" for i in range(n_view)]
+    seen = vision(4 * vision_heads * r.choice((2, 3, 5)), r.randint(1, 3), vision_heads, r.choice((20, 36, 50)), patch, r.choice((0, 1, 4, 4)),
+                  layer_norm_eps=r.choice((1e-5, 1e-6)), rope_theta=r.choice((100.0, 37.5)))
+    language = text(4 * text_heads * r.choice((1, 2, 3)), r.randint(1, 3), text_heads, r.choice((20, 36, 50)), n_position)
+    words = r.choice((*TEXTS, *SENTENCES, *SENTENCES))
+    n_row = r.choice((None, r.randint(3, n_position), r.randint(10, n_position), n_position))
+    own = {words: r.randint(3, n_row), "another one": 3} if n_row and r.random() < 0.5 else {}
+    texts = {"max_length": n_row or r.randint(3, n_position), "padding_length": n_row, "padding_length_by_instruction": own,
+             "sub_sentence_present": r.random() < 0.8, "zero_padded_tokens": r.random() < 0.3}
+    style = {"padding_strategy": r.choice(("key_padding_mask", "zero_fill")), "residual_style": r.choice(("normalized", "pre_norm")),
+             "attention_backend": r.choice(("manual", "sdpa"))}
+    inner = 4 * max(1, heads // 2) * r.choice((1, 2, 5))
+    fusion = (4 * heads * max(1, heads // 2) * r.choice((1, 2)), heads, r.randint(1, 3), r.choice((20, 50)), inner, style)
+    action = (r.randint(1, 14), r.randint(1, 4), r.randint(1, 3), r.choice((16, 44)), r.choice((20, 36)))
+    sizes = parts(side, fusion, action, texts, position_embedding=r.choice(("view", "learned_patch")),
+                  encode_views_separately=r.random() < 0.5)
+    checkpoint = Checkpoint(seen, language, sizes, tuple(views))
+    options = {"vision_tokens": tokens_read(), "views": views}
+    return Case(seed, {view: (side, side, "png") for view in views}, words, checkpoint, options=options)
+
+
+DRAWN = {"turbovla_authors": draw}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

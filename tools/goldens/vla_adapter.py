@@ -21,6 +21,7 @@ does with the gripper is cut out of evaluate_calvin.py, which imports a simulato
 import ast
 import importlib.machinery
 import os
+import random
 import sys
 import types
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from . import bitvla, openvla
-from .cases import Case, copy_tokenizer
+from .cases import TEXTS, Case, copy_tokenizer
 from .draw import bfloat16, f32
 from .files import bfloat16_bits, state_dict, write_archive, write_json
 from .openvla import LM, Tower, read_options
@@ -155,6 +156,32 @@ CASES = {
     "vla_adapter/calvin": case(74, "push the sliding door to the LEFT side", Checkpoint(
         Tower(48, 2, 60), Tower(32, 3, 36), decoder(40, 3, 5, 1, 28), 42, platform="calvin", prefixes=("", "module.")), frame=(50, 50, "png")),
 }
+
+# --- random configurations ------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case from the seed: both heads, up to three cameras, so many patches that the rows of the task end before, at or behind the image's."""
+    r = random.Random(f"vla_adapter {seed}")
+    is_pro, kv = r.random() < 0.5, r.choice((1, 1, 2, 3))
+    heads = kv * r.choice((1, 2, 4))
+    d_model = next(heads * d_head for d_head in (8, 16, 24, 2, 4) if heads * d_head % (16 if is_pro else 8) == 0) if r.random() < 0.9 else 12 * heads
+    towers = [Tower(16 * r.choice((1, 2, 3)), r.randint(2, 4), r.randint(10, 60)) for _ in range(2)]
+    text = decoder(d_model, r.randint(1, 4), heads, kv, r.choice((20, 36, 50)), rms_norm_eps=r.choice((1e-6, 1e-5)),
+                   rope_theta=r.choice((1e6, 1e4)))
+    n_view = r.choice((1, 2, 2, 3))
+    side = 14 * r.choice((1, 2, 3, 4, {1: 22, 2: 16, 3: 13}[n_view], {1: 24, 2: 17, 3: 14}[n_view]))
+    others = r.choice(((), ("libero_goal_no_noops",)))
+    checkpoint = Checkpoint(
+        *towers, text, side, is_pro=is_pro, platform=r.choice(("libero", "calvin")), n_shard=r.choice((1, 1, 3)), step=r.choice(("", "150000_", "latest_")),
+        prefixes=tuple(r.choice(("", "module.")) for _ in range(2)), has_language_head=r.random() < 0.5, other_stats=others)
+    views = ("third_person", "wrist", "left_wrist")[:n_view] if n_view != 2 or r.random() < 0.5 else ()
+    frame = (r.randint(12, 90), r.randint(12, 90), r.choice(("png", "png", "jpg"))) if r.random() < 0.6 else ()
+    return case(seed, r.choice((*TEXTS, "", "Pick UP the <tool_call> cube<|im_start|>")), checkpoint, views, frame,
+                **({"stats": STATISTICS[checkpoint.platform]} if others else {}))
+
+
+DRAWN = {"vla_adapter": draw}
 
 
 # --- the reference --------------------------------------------------------------------------------------------------

@@ -7,13 +7,14 @@ the policy and is not asked at inference, it has two tensors of each half.
 """
 
 import contextlib
+import random
 import types
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import gr00t_n1_7
 from . import lerobot_layout as layout
-from .cases import LIBERO_FRAMES, LIBERO_INSTRUCTION, Case, backbone_folder
+from .cases import LIBERO_FRAMES, LIBERO_INSTRUCTION, MODES, TEXTS, Case, backbone_folder
 from .files import bfloat16_bits, write_json, write_stream
 from .gr00t_n1_7 import N_VOCAB, TOKENS, QwenTaps, text, vision
 from .parameters import linear, parameter, statistics
@@ -194,6 +195,38 @@ CASES = {
                enable_world_model=False, normalization_mapping=layout.IDENTITY | {"STATE": "QUANTILES", "ACTION": "IDENTITY"}),
         {"camera": (16, 24)}, d_state=4, d_action=7, side=16, zero_spread=(2,))),
 }
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case whose every size comes from the seed: prompts, tokens, cameras, steps of the pipeline; in one of ten an instruction that the backbone takes an image for."""
+    r = random.Random(f"vla_jepa {seed}")
+    heads, kv, d_head = r.choice(((4, 2, 8), (3, 1, 12), (6, 3, 8), (5, 5, 8), (2, 2, 16), (1, 1, 12)))
+    vision_heads, depth, side, n_view = r.choice((1, 2, 3)), r.randint(3, 5), 8 * r.choice((2, 3, 4)), r.randint(1, 3)
+    deepstack = sorted(r.sample(range(depth), r.choice((1, 2, 3))))
+    sizes = (vision(vision_heads * 4 * r.choice((2, 3, 4)), depth, vision_heads, 2 * r.randint(8, 20), r.randint(3, 7), deepstack),
+             text(2 * r.randint(6, 18), r.randint(4, 6), heads, kv, d_head, r.choice((32, 50)), {8: (2, 1, 1), 12: (2, 2, 2), 16: (4, 2, 2)}[d_head])
+             | r.choice(({}, {"vocab_size": N_VOCAB + 60})))
+    frames = {f"cam{i}": (r.randint(12, 60), r.randint(12, 60), r.choice(("png", "png", "jpg"))) for i in range(n_view)}
+    area = [r.randint(10, 40), r.randint(10, 40)] if r.random() < 0.6 else None
+    if area is None:
+        frames = {view: (*frames["cam0"][:2], frame[2]) for view, frame in frames.items()}
+    world_model, video = r.random() < 0.5, r.choice((4, 6, 8))
+    modes = {"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)}
+    flags = {key: r.random() < 0.6 for key in ("clip_normalized_actions", "pre_snap_gripper_action", "binarize_gripper_action")}
+    settings = policy(
+        r.randint(1, 12), r.choice((1, 2, 4, 7)), r.choice(((2, 6), (3, 4), (1, 10), (None, None))), r.randint(1, 5), r.randint(6, 30), r.randint(1, 12),
+        action_model_type="DiT-test", resize_images_to=area, enable_world_model=world_model, num_video_frames=video, torch_dtype=r.choice(("float32", "bfloat16")),
+        num_action_tokens_per_timestep=r.randint(1, 8), normalization_mapping=modes, action_num_timestep_buckets=r.choice((1000, 1000, 100)),
+        prompt_template=r.choice((PROMPT, SHORT, "{instruction}{e_actions}", "{actions} {instruction}\n{e_actions}!")), **flags)
+    checkpoint = Checkpoint(*sizes, settings, {view: frame[:2] for view, frame in frames.items()}, r.choice((0, 1, 7, 20)), r.randint(1, 12), side,
+                            tubelet=r.choice((1, 2)), dtype=r.choice(("BF16", "BF16", "F32")), prunes=r.choice(("embed_tokens", "lm_head", "")))
+    words = r.choice((*TEXTS, "{actions} of %s {0}")) if r.random() < 0.9 else "go<|placeholder|>"
+    return Case(seed, frames, words, checkpoint)
+
+
+DRAWN = {"vla_jepa": draw}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------

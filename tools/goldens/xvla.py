@@ -6,12 +6,13 @@ A checkpoint holds the tokenizer, which LeRobot fetches from a hub, in `tokenize
 """
 
 import math
+import random
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import lerobot_layout as layout
-from .cases import LIBERO_INSTRUCTION, Case, copy_tokenizer
+from .cases import LIBERO_INSTRUCTION, MODES, TEXTS, Case, copy_tokenizer
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import linear, norm, parameter, statistics
 from .recorder import Taps, given_noise
@@ -228,7 +229,7 @@ def policy(horizon, steps, d, depth, heads, **more):
             "max_action_dim": 20, "num_domains": 3, "len_soft_prompts": 4, "dim_time": 8, "max_len_seq": 64, **more}
 
 
-MODES = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
+MAPPING = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
 CASES = {
     # Two views of two aspects, both with a border; a third that the robot does not have; as published but smaller: grippers as logits,
     # windows that the map does not fill, text padded to its limit.
@@ -243,21 +244,67 @@ CASES = {
         vision((8, 16), (1, 1), (2, 2), (2, 4), 4, 24, max_position_embeddings=20), text(24, 1, 3, 36),
         policy(4, 3, 28, 2, 4, resize_imgs_with_padding=(24, 24), tokenizer_max_length=14, pad_language_to="longest", use_hetero_proj=True,
                use_proprio=False, action_mode="auto", max_action_dim=9, empty_cameras=1, max_len_seq=70, dim_time=7,
-               normalization_mapping=MODES | {"ACTION": "QUANTILES"}), {"top": (24, 24), "wrist": (24, 24), "side": (30, 37)}, d_state=0, d_action=6,
+               normalization_mapping=MAPPING | {"ACTION": "QUANTILES"}), {"top": (24, 24), "wrist": (24, 24), "side": (30, 37)}, d_state=0, d_action=6,
         domain=2, dtype="BF16", rename={"observation.images.cam": "observation.images.side"})),
     # The names of the authors' own code; frames of the network's size, of which nothing is a multiple; two arms of joints; no soft prompts;
     # one view.
     "xvla/joints": Case(53, {"camera": (29, 43, "png")}, "push the plate slowly</s> now", Checkpoint(
         vision((10, 18, 20), (1, 1, 1), (1, 3, 2), (2, 3, 1), 4, 16, patch=(5, 3, 3), stride=(3, 2, 2), mlp_ratio=2.5), text(16, 2, 4, 20),
         policy(6, 5, 20, 2, 2, action_mode="joint", max_action_dim=14, len_soft_prompts=0, tokenizer_max_length=12, max_state_dim=16,
-               mlp_ratio=1.7, normalization_mapping=MODES), {"camera": (29, 43)}, d_state=14, d_action=14, vendored=True, zero_spread=(3,))),
+               mlp_ratio=1.7, normalization_mapping=MAPPING), {"camera": (29, 43)}, d_state=14, d_action=14, vendored=True, zero_spread=(3,))),
     # A window larger than the map; 12 numbers of two arms, whose state is padded to 20; ranges; ten steps.
     "xvla/two_arms": Case(54, {"left": (24, 24, "png"), "right": (20, 61, "png")}, "close drawer 42!", Checkpoint(
         vision((16, 12), (2, 1), (4, 3), (4, 2), 12, 12, prenorm=(True, False)), text(12, 1, 1, 30),
         policy(7, 10, 16, 2, 1, resize_imgs_with_padding=(24, 24), action_mode="so101_bimanual", tokenizer_max_length=9, max_state_dim=20,
                num_image_views=2, len_soft_prompts=1, max_len_seq=36,
-               normalization_mapping=MODES | {"STATE": "MIN_MAX", "ACTION": "MIN_MAX"}), {"left": (24, 24), "right": (24, 24)}, d_state=12, d_action=12)),
+               normalization_mapping=MAPPING | {"STATE": "MIN_MAX", "ACTION": "MIN_MAX"}), {"left": (24, 24), "right": (24, 24)}, d_state=12, d_action=12)),
 }
+
+# --- random configurations -------------------------------------------------------------------------------------------
+
+
+def draw(seed):
+    """A case from the seed: stages, windows and groups of every size, all action spaces, both spellings of the backbone; in one of ten more
+    tokens than positions."""
+    r = random.Random(f"xvla {seed}")
+    n_stage = r.randint(1, 4)
+    heads = [r.choice((1, 2, 3)) for _ in range(n_stage)]
+    widths = [h * g for h, g in zip(heads, [2 * r.choice((2, 3, 4, 5)) for _ in range(n_stage)])]
+    groups = [r.choice([g for g in (1, 2, 3, 4, 6, 8) if w % g == 0]) for w in widths]
+    patch = [r.choice((3, 5, 7)), *(r.choice((1, 3, 3)) for _ in range(3))]
+    stride, prenorm = [r.choice((2, 3, 4)), *(r.choice((1, 2, 2)) for _ in range(3))], [r.random() < 0.5 for _ in range(4)]
+    lm_heads = r.choice((1, 2, 3))
+    d_lm = 4 * lm_heads * r.choice((1, 2, 3))
+    seen = vision(widths, [r.randint(1, 2) for _ in widths], heads, groups, r.choice((2, 3, 4, 12)), d_lm, patch, stride[:n_stage], prenorm,
+                  mlp_ratio=r.choice((2.0, 4.0, 1.3)))
+    mode, frames = r.choice(("ee6d", "ee6d", "auto", "joint", "agibot_ee6d", "franka_joint7", "so101_bimanual")), {}
+    for i in range(r.randint(1, 4)):
+        frames[f"cam{i}"] = (r.randint(12, 50), r.randint(12, 50), r.choice(("png", "png", "jpg"))) if i == 0 or r.random() < 0.8 else None
+    size = (r.randint(12, 36), r.randint(12, 36))
+    resizes = r.random() < 0.8
+    if not resizes:
+        frames = {view: frame and (*size, "png") for view, frame in frames.items()}
+    reads_state = mode in ("ee6d", "joint", "so101_bimanual") or r.random() < 0.6
+    d_action = r.randint(1, 9) if mode == "auto" else OUTPUTS[mode]
+    columns = {"auto": d_action + r.randint(0, 3), "joint": 14}.get(mode, 20)
+    d_state = r.choice((7, 12, 20)) if reads_state else 0
+    max_state = 20 if mode == "so101_bimanual" else max(20, d_state) + r.randint(0, 4)
+    head = r.choice((1, 2, 4))
+    more = {"resize_imgs_with_padding": size if resizes else None, "action_mode": mode, "max_action_dim": columns, "use_proprio": reads_state,
+            "max_state_dim": max_state, "num_image_views": r.choice((None, None, 1, 4)), "empty_cameras": r.choice((0, 0, 1)) if resizes else 0,
+            "use_hetero_proj": r.random() < 0.3, "len_soft_prompts": r.choice((0, 1, 5)), "dim_time": r.choice((4, 7, 32)), "mlp_ratio": r.choice((4.0, 1.7)),
+            "tokenizer_max_length": r.randint(4, 40), "pad_language_to": r.choice(("max_length", "max_length", "longest")),
+            "max_len_seq": r.choice((1500, 1500, 1500, 60)),
+            "normalization_mapping": {"VISUAL": "IDENTITY", "STATE": r.choice(("IDENTITY", *MODES)), "ACTION": r.choice(("IDENTITY", *MODES))}}
+    settings = policy(r.randint(1, 9), r.choice((1, 2, 5, 10)), 4 * head * r.choice((1, 2, 3)), r.randint(1, 4), head, **more)
+    views = {view: frame[:2] if frame else size for view, frame in frames.items()}
+    language = text(d_lm, r.randint(1, 3), lm_heads, r.choice((12, 30, 50)), r.choice((900, 900, 900, 40)))
+    checkpoint = Checkpoint(seen, language, settings, views, d_state, d_action, r.randint(0, 2), dtype=r.choice(("F32", "F32", "BF16")),
+                            vendored=r.random() < 0.4)
+    return Case(seed, frames, r.choice((*TEXTS, "Ouvre le TIROIR à côté de l'évier, 한국어 Ⅷ ﬁn", "</s>a<mask>  <pad>it's")), checkpoint)
+
+
+DRAWN = {"xvla": draw}
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------
