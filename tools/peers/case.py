@@ -29,7 +29,9 @@ def reference(case, dtype, n_thread, compiled):
     warnings.filterwarnings("ignore")
     torch.set_num_threads(n_thread)
     policy, before, _ = recorder.load(case / "checkpoint", dtype)
-    predict = torch.compile(policy.predict_action_chunk) if compiled else policy.predict_action_chunk
+    predict = torch.compile(policy.predict_action_chunk) if compiled == "all" else policy.predict_action_chunk
+    if compiled not in (None, "all"):
+        policy.get_submodule(compiled).compile()
     noise, batch = torch.from_numpy(np.load(case / "noise.npy"))[None], before(recorder.read_observation(case))
 
     def run():
@@ -48,7 +50,8 @@ def main():
     parser.add_argument("--tokens", type=int, default=32, help="of text; of a policy that reads none 0")
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--dtype", default="float32", choices=("float32", "published"), help="PyTorch's; published: the file's own")
-    parser.add_argument("--compile", action="store_true", help="torch.compile for the whole of it")
+    parser.add_argument("--compile", nargs="?", const="all", metavar="MODULE",
+                        help="torch.compile for the whole of it, or for a module where a hundred steps in one graph take too long: diffusion.unet")
     parser.add_argument("--kernels", default="float32", help="as vla bench takes them; default: its own choice")
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
     parser.add_argument("--reference", action="store_true", help=argparse.SUPPRESS)  # in a process of its own
@@ -61,7 +64,7 @@ def main():
     bench += ["--tokens", args.tokens] if args.tokens else []
     bench += [] if args.kernels == "default" else ["--kernels", args.kernels]
     peer = [sys.executable, __file__, "--case", case, "--dtype", args.dtype, "--threads", args.threads, "--reference"]
-    peer += ["--compile"] if args.compile else []
+    peer += ["--compile", args.compile] if args.compile else []
     in_turn.compare(peer, bench, args.rounds, args.threads)
 
 
