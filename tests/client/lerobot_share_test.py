@@ -88,15 +88,15 @@ def test_a_peer_with_many_connections_gets_a_robots_turns_only():
             [thread.start() for thread in threads]
             while not all(counts):
                 time.sleep(0.01)
-            others, n_act = 0, 10
-            for _ in range(n_act):
+            others = []
+            for _ in range(11):
                 robot.observe(observation)
                 before = sum(counts)
                 robot.actions()
-                others += sum(counts) - before
+                others.append(sum(counts) - before)
             stop.set()
             [thread.join() for thread in threads]
-        assert others <= 18 * n_act, others  # with a turn for each connection it would be 24 and more, this client being busy
+        assert sorted(others)[5] <= 18, others  # with a turn for each connection all were 24 and more, this client being busy
 
 
 def test_observations_that_nobody_asks_for_are_forgotten_before_they_are_too_much(case):
