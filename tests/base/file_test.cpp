@@ -139,6 +139,19 @@ TEST_CASE("a pipe, a device and an open file get bytes that are written out of o
   CHECK(folders.error().code == Code::io);
 }
 
+TEST_CASE("a temporary file has no name, and its bytes are read where they were written") {
+  const int fd = open_temporary();
+  REQUIRE(fd >= 0);
+  const std::string text = "weights";
+  char read[8] = {};
+  struct stat info = {};
+  CHECK(write_all(fd, std::as_bytes(std::span(text))));
+  CHECK(::pread(fd, read, sizeof(read), 0) == 7);
+  CHECK(read == text);
+  CHECK((::fstat(fd, &info) == 0 && info.st_nlink == 0));
+  ::close(fd);
+}
+
 TEST_CASE("a new file never replaces one, and has the mode that was asked for") {
   const Folder folder;
   const std::string file = folder / "secret", text = "key";
