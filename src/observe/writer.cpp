@@ -86,7 +86,7 @@ void Writer::run() {
       pieces.swap(waiting_);
     }
     for (std::string& piece : pieces) {
-      write_all(piece);
+      if (!write_all(piece)) ++n_dropped_;
       const std::lock_guard lock(mutex_);
       waiting_bytes_ -= piece.size();
       std::string().swap(piece);
@@ -101,7 +101,7 @@ bool Writer::is_out_of_patience() const {
 }
 
 /// A pipe takes PIPE_BUF bytes at once without blocking where it says that it takes any.
-void Writer::write_all(const std::string& piece) {
+bool Writer::write_all(const std::string& piece) {
   for (std::size_t at = 0; at < piece.size() && failure_ == 0;) {
     pollfd item = {fd_, POLLOUT, 0};
     const int ready = ::poll(&item, 1, kPollMs);
@@ -120,10 +120,10 @@ void Writer::write_all(const std::string& piece) {
   if (failure_ == 0) {
     last_ = position_;
     position_ += static_cast<std::int64_t>(piece.size());
-  } else if (!piece.empty()) {
-    ++n_dropped_;
-    if (is_file_ && ::ftruncate(fd_, position_) != 0) return;  // a full disk keeps the whole pieces
+    return true;
   }
+  [[maybe_unused]] const int cut = is_file_ ? ::ftruncate(fd_, position_) : 0;  // a full disk keeps the whole pieces
+  return false;
 }
 
 /// A disk that is full still has the place of the last piece.

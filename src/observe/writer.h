@@ -44,7 +44,7 @@ class Writer {
 
  private:
   void run();
-  void write_all(const std::string& piece);
+  bool write_all(const std::string& piece);
   void write_tail();
   bool is_out_of_patience() const;
 
