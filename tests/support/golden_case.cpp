@@ -12,6 +12,7 @@
 #include "base/file.h"
 #include "base/npy.h"
 #include "support/editable_bundle.h"
+#include "support/ggml_threads.h"
 
 namespace vla::test {
 
@@ -59,8 +60,7 @@ std::vector<std::string> golden_paths() {
 
 std::unique_ptr<Engine> load_engine(const std::string& bundle, const std::string& taps, const std::string& kernels,
                                     const std::vector<Tap>& inject) {
-  // Threads of ggml spin until all have come, which takes long where the machine is busy.
-  const int n_thread = kernels == "ggml" ? 1 : 2;
+  const int n_thread = threads_for(kernels, 2);
   auto engine = Engine::load(bundle, {.n_thread = n_thread, .kernels = kernels, .tap_pattern = taps, .inject = inject});
   REQUIRE_MESSAGE(engine.ok(), (engine ? "" : engine.error().message()));
   return std::move(*engine);

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "devices/devices.h"
+#include "support/ggml_threads.h"
 
 namespace vla::test {
 
@@ -61,8 +62,7 @@ class GraphRunner {
 
  private:
   static std::unique_ptr<Device> open(int n_thread, const std::string& kernels) {
-    // Threads of ggml spin until all have come, which takes long where the machine is busy.
-    auto device = open_device(kernels == "ggml" ? 1 : n_thread, kernels);
+    auto device = open_device(threads_for(kernels, n_thread), kernels);
     REQUIRE_MESSAGE(device.ok(), (device ? "" : device.error().message()));
     return std::move(*device);
   }
