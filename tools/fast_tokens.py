@@ -41,8 +41,7 @@ class Reference:
 
         fast.write(folder / "actions")
         self.n_action = len(fast.vocabulary()[0])
-        n_action = self.n_action + SKIP
-        pi0_fast.write_tokenizer(n_action, pi0_fast.N_TOKEN + 1 + n_action, folder / "text")
+        pi0_fast.write_tokenizer(self.n_action + SKIP, folder / "text")
         self.policy = types.SimpleNamespace(
             config=types.SimpleNamespace(validate_action_token_prefix=required, fast_skip_tokens=SKIP),
             action_tokenizer=AutoProcessor.from_pretrained(folder / "actions", trust_remote_code=True),

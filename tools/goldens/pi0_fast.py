@@ -85,12 +85,12 @@ class Fast:
         (folder / "processing_action_tokenizer.py").write_text(PROCESSOR, encoding="utf-8")
 
 
-def write_tokenizer(n_action, n_vocab, folder):
-    """That of the other cases of π0 with a token for the end of actions and `n_action` as the last of `n_vocab`, of which FAST's ids are the
+def write_tokenizer(n_action, folder, n_unused=0):
+    """That of the other cases of π0 with a token for the end of actions, unused ones, and `n_action` behind them, of which FAST's ids are the
     first; "Action" and ":" stay two tokens, as PaliGemma's are."""
     source = RECORDED / "tokenizers/pi"
     spec = json.loads((source / "tokenizer.json").read_text())
-    first = n_vocab - n_action
+    first = N_TOKEN + 1 + n_unused
     spec["model"]["vocab"] |= {STOP: N_TOKEN} | {f"<unused{i}>": i for i in range(N_TOKEN + 1, first)}
     spec["model"]["vocab"] |= {f"<loc{i:04}>": first + i for i in range(n_action)}
     spec["model"]["merges"].remove(["Action", ":"])
@@ -172,7 +172,7 @@ class Checkpoint:
         folder, c, shapes = Path(folder), self.config, self.shapes()
         write_json(folder / "config.json", c, indent=2)
         write_json(folder / "dims.json", self.dims(), indent=1)
-        write_tokenizer(self.n_action_token, self.n_vocab, folder / "tokenizer")
+        write_tokenizer(self.n_action_token, folder / "tokenizer", self.n_vocab - N_TOKEN - 1 - self.n_action_token)
         self.fast.write(folder / "action_tokenizer")
         self.write_pipelines(c, seed, folder)
         shared = {f"{TOWER}model.language_model.embed_tokens.weight": f"{TOWER}lm_head.weight"}

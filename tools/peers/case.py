@@ -29,8 +29,10 @@ def reference(case, dtype, n_thread, compiled):
     warnings.filterwarnings("ignore")
     torch.set_num_threads(n_thread)
     policy, before, _ = recorder.load(case / "checkpoint", dtype)
-    predict = torch.compile(policy.predict_action_chunk) if compiled == "all" else policy.predict_action_chunk
-    if compiled not in (None, "all"):
+    predict = policy.predict_action_chunk
+    if compiled == "all":
+        predict = torch.compile(predict)
+    elif compiled:
         policy.get_submodule(compiled).compile()
     noise, batch = torch.from_numpy(np.load(case / "noise.npy"))[None], before(recorder.read_observation(case))
 
