@@ -79,4 +79,11 @@ inline Observation observation() {
   return {{{"top", grey(0)}, {"wrist", grey(255)}, {"side", std::nullopt}}, {{"state", {1.5f, 6.0f}}}, "pick up"};
 }
 
+/// The refusal of the sample with one key replaced.
+inline std::string refused_with(const std::string& key, Value value) {
+  EditableBundle bundle = sample();
+  bundle.set(key, std::move(value));
+  return refusal(create(bundle), Code::bad_bundle);
+}
+
 }  // namespace vla::test
