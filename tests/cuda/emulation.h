@@ -219,6 +219,7 @@ inline unsigned to_bf16(float low, float high) {
   return half(low) | half(high) << 16;
 }
 inline float from_f16(unsigned bits) { return test::cuda::f16_to_float(bits); }
+inline float reciprocal(float x) { return 1 / x; }
 inline float power_of_two(float x) { return exp2f(x); }
 
 }  // namespace vla::cuda::dev

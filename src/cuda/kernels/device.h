@@ -134,6 +134,12 @@ VLA_DEVICE float from_f16(unsigned bits) {
   asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(static_cast<unsigned short>(bits)));
   return x;
 }
+/// 1 / x with a relative error of 2^-23; zero for x above 2^126, and for infinity.
+VLA_DEVICE float reciprocal(float x) {
+  float y;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
 /// 2^x with a relative error of 2^-22; zero for minus infinity and below the normal floats.
 VLA_DEVICE float power_of_two(float x) {
   float y;

@@ -7,26 +7,39 @@
 
 namespace vla::cuda {
 
-/// Within a few units in the last place. Written without a switch, because nvcc would build a jump table at every use.
-/// Sources: torch silu, gelu, relu, mish.
-VLA_DEVICE float activate(Activation activation, float x) {
-  if (activation == Activation::none) return x;
-  if (activation == Activation::gelu_erf) return 0.5f * x * (1 + erff(0.70710678f * x));
+/// Operands that change nothing, in the place of those that an epilogue lacks: x + -0 is x, for zeros of both signs
+/// too.
+constexpr float kAddsNothing = -0.0f, kScalesNothing = 1;
+
+VLA_DEVICE bool is_sigmoid(Activation activation) {
+  return activation == Activation::silu || activation == Activation::gelu_tanh;
+}
+/// x / (1 + e^-u). With u = x this is SiLU; since 1 + tanh(u / 2) = 2 / (1 + e^-u), it also gives GELU's tanh form.
+VLA_DEVICE float activate_by_sigmoid(Activation activation, float x) {
+  const float u = activation == Activation::silu ? x : 1.5957691216f * (x + 0.044715f * x * x * x);
+  return x * dev::reciprocal(1 + expf(-u));
+}
+VLA_DEVICE float activate_otherwise(Activation activation, float x) {
   if (activation == Activation::relu) return x < 0 ? 0 : x;
   if (activation == Activation::relu_squared) return x < 0 ? 0 : x * x;
-  if (activation == Activation::mish) {  // as kernels/math.h
-    const float t = expf(-fabsf(x)), above = x < 0 ? t * (t + 2) : 1 + 2 * t;
-    return x * (above / (above + (x < 0 ? 2 : 2 * t * t)));
-  }
-  // x / (1 + e^-u). With u = x this is SiLU; since 1 + tanh(u / 2) = 2 / (1 + e^-u), it also gives GELU's tanh form.
-  const float u = activation == Activation::silu ? x : 1.5957691216f * (x + 0.044715f * x * x * x);
-  return x / (1 + expf(-u));
+  if (activation == Activation::gelu_erf) return 0.5f * x * (1 + erff(0.70710678f * x));
+  // mish, as kernels/math.h
+  const float t = expf(-fabsf(x)), above = x < 0 ? t * (t + 2) : 1 + 2 * t;
+  return x * (above * dev::reciprocal(above + (x < 0 ? 2 : 2 * t * t)));
+}
+/// Within a few units in the last place. Written without a switch, because nvcc would build a jump table at every use.
+/// A division has a branch of its own, which an epilogue's many values would take one after the other. Sources: torch
+/// silu, gelu, relu, mish.
+VLA_DEVICE float activate(Activation activation, float x) {
+  if (activation == Activation::none) return x;
+  return is_sigmoid(activation) ? activate_by_sigmoid(activation, x) : activate_otherwise(activation, x);
 }
 
 /// What an epilogue reads for two adjacent columns of a row, so that it can be asked for before the sums are there.
 struct PairEnds {
-  float2 bias = {0, 0}, factor = {1, 1}, gate = {0, 0}, residual = {0, 0};
-  bool has_second, has_gate;
+  float2 bias = {kAddsNothing, kAddsNothing}, factor = {kScalesNothing, kScalesNothing}, gate = {0, 0};
+  float2 residual = {kAddsNothing, kAddsNothing};
+  bool has_second = false, has_gate = false;
 };
 VLA_DEVICE PairEnds load_ends(const Epilogue& e, std::int64_t row, int column, int n_column) {
   PairEnds ends;
@@ -46,22 +59,24 @@ VLA_DEVICE PairEnds load_ends(const Epilogue& e, std::int64_t row, int column, i
   return ends;
 }
 
-/// y of one sum. Products and sums are not fused, so y without an activation equals the CPU's to the bit.
+/// y of one sum, where activate(x) is the activation. Products and sums are not fused, so y without an activation
+/// equals the CPU's to the bit.
+template <class Activate>
 VLA_DEVICE float finish(const Epilogue& e, bool has_gate, float sum, float bias, float factor, float gate,
-                        float residual) {
-  if (e.bias) sum = dev::add(sum, bias);
-  sum = has_gate ? dev::multiply(activate(e.activation, gate), sum) : activate(e.activation, sum);
-  if (e.factor) sum = dev::multiply(sum, factor);
-  if (e.residual) sum = dev::add(sum, residual);
-  return e.ends_in_relu ? activate(Activation::relu, sum) : sum;
+                        float residual, Activate activate) {
+  sum = dev::add(sum, bias);
+  const float activated = activate(has_gate ? gate : sum);
+  sum = dev::multiply(has_gate ? dev::multiply(activated, sum) : activated, factor);
+  sum = dev::add(sum, residual);
+  return e.ends_in_relu && sum < 0 ? 0 : sum;
 }
 
 /// Stores y of two adjacent sums; the second may be after the last column.
 VLA_DEVICE void finish_pair(const Epilogue& e, const PairEnds& ends, float first, float second, std::int64_t row,
                             int column) {
-  const bool has_gate = ends.has_gate;
-  first = finish(e, has_gate, first, ends.bias.x, ends.factor.x, ends.gate.x, ends.residual.x);
-  second = ends.has_second ? finish(e, has_gate, second, ends.bias.y, ends.factor.y, ends.gate.y, ends.residual.y) : 0;
+  const auto activated = [&](float x) { return activate(e.activation, x); };
+  first = finish(e, ends.has_gate, first, ends.bias.x, ends.factor.x, ends.gate.x, ends.residual.x, activated);
+  second = finish(e, ends.has_gate, second, ends.bias.y, ends.factor.y, ends.gate.y, ends.residual.y, activated);
   const std::int64_t at = row * e.y_stride + column;
   const bool together = ends.has_second && e.y_stride % 2 == 0;
   if (e.is_bf16) {

@@ -114,12 +114,35 @@ class TileEnd {
   /// gate's sums first.
   template <class OfRow, class Word>
   VLA_DEVICE void leave(const std::byte* sums, void* partial, OfRow of_row, Word word) const {
+    if (together_)
+      leave_rows<kBatch, true>(sums, partial, of_row, word);
+    else
+      leave_rows<1, false>(sums, partial, of_row, word);
+  }
+  /// Computes y of value(of_row(row), bits of a sum, which of the four columns).
+  template <class OfRow, class Value>
+  VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value) const {
+    const Activation activation = e_.activation;
+    const bool has_gate = kGated || e_.gate != nullptr;
+    if (together_ && activation == Activation::none && !has_gate)
+      finish_rows<kBatch, true>(sums, of_row, value, [](float x) { return x; });
+    else if (together_ && is_sigmoid(activation))
+      finish_rows<kBatch, true>(sums, of_row, value, [=](float x) { return activate_by_sigmoid(activation, x); });
+    else
+      finish_rows<1, false>(sums, of_row, value, [=](float x) { return activate(activation, x); });
+  }
+
+ private:
+  static constexpr int kQuads = kColumns / 4 / (kGated ? 2 : 1), kRowsAtOnce = kColumns * 2 / kQuads, kBatch = 4;
+
+  template <int kRowsAhead, bool kTogether, class OfRow, class Word>
+  VLA_DEVICE void leave_rows(const std::byte* sums, void* partial, OfRow of_row, Word word) const {
     constexpr int kHalves = kGated ? 2 : 1;
     auto* to = static_cast<unsigned*>(partial) + column_;
 #pragma unroll 1
-    for (int first = thread_index() / kQuads; first < end_; first += kRowsAtOnce * kBatch)
+    for (int first = thread_index() / kQuads; first < end_; first += kRowsAtOnce * kRowsAhead)
 #pragma unroll
-      for (int i = 0; i < kBatch; ++i) {
+      for (int i = 0; i < kRowsAhead; ++i) {
         const int row = first + kRowsAtOnce * i;
         if (row >= end_) break;
         const auto of = of_row(row0_ + row);
@@ -128,38 +151,41 @@ class TileEnd {
           const uint4 four = sums_of(sums, row, half);
           const unsigned words[4] = {word(of, four.x), word(of, four.y), word(of, four.z), word(of, four.w)};
           const std::int64_t at = static_cast<std::int64_t>(row0_ + row) * kHalves + half;
-          store_four(to + at * n_column_, words, together_, n_);
+          store_four(to + at * n_column_, words, kTogether, n_);
         }
       }
   }
-  /// Computes y of value(of_row(row), bits of a sum, which of the four columns). Loads of kBatch rows are under way at
-  /// a time.
-  template <class OfRow, class Value>
-  VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value) const {
-    Four bias = {}, factor = {}, gate_bias = {};
-    if (e_.bias && n_ > 0) bias = load_four(e_.bias + column_, together_, n_);
-    if (kGated && gate_bias_ && n_ > 0) gate_bias = load_four(gate_bias_ + column_, together_, n_);
-    if (e_.factor && n_ > 0) factor = load_four(e_.factor + column_, together_, n_);
+  /// The same for one activation. Loads of kRowsAhead rows are under way at a time, and their values side by side: each
+  /// activation has code of its own, as instructions of a row that are not in the cache take longer than the row.
+  template <int kRowsAhead, bool kTogether, class OfRow, class Value, class Activate>
+  VLA_DEVICE void finish_rows(const std::byte* sums, OfRow of_row, Value value, Activate activate) const {
+    const auto load = [&](const float* from, std::int64_t at, float otherwise) {
+      return from && n_ > 0 ? load_four(from + at, kTogether || together_, n_)
+                            : Four{{otherwise, otherwise, otherwise, otherwise}};
+    };
+    const Four bias = load(e_.bias, column_, kAddsNothing), factor = load(e_.factor, column_, kScalesNothing);
+    const Four gate_bias = load(kGated ? gate_bias_ : nullptr, column_, kAddsNothing);
 #pragma unroll 1
-    for (int first = thread_index() / kQuads; first < end_; first += kRowsAtOnce * kBatch) {
-      Four gate[kBatch] = {}, residual[kBatch] = {};
-      decltype(of_row(0)) of[kBatch] = {};
+    for (int first = thread_index() / kQuads; first < end_; first += kRowsAtOnce * kRowsAhead) {
+      Four gate[kRowsAhead], residual[kRowsAhead];
+      decltype(of_row(0)) of[kRowsAhead] = {};
 #pragma unroll
-      for (int i = 0; i < kBatch; ++i) {
+      for (int i = 0; i < kRowsAhead; ++i) {
         const int row = row0_ + first + kRowsAtOnce * i;
         if (first + kRowsAtOnce * i >= end_) break;
         of[i] = of_row(row);
         const std::int64_t at = static_cast<std::int64_t>(row) * n_column_ + column_;
-        if (!kGated && e_.gate) gate[i] = load_four(e_.gate + at, together_, n_);
-        if (e_.residual) residual[i] = load_four(e_.residual + at, together_, n_);
+        gate[i] = load(kGated ? nullptr : e_.gate, at, 0);
+        residual[i] = load(e_.residual, at, kAddsNothing);
       }
 #pragma unroll
-      for (int i = 0; i < kBatch; ++i) {
-        if (first + kRowsAtOnce * i >= end_) break;
-        const uint4 four = sums_of(sums, first + kRowsAtOnce * i, kGated ? 1 : 0);
+      for (int i = 0; i < kRowsAhead; ++i) {
+        const int row = first + kRowsAtOnce * i;
+        if (row >= end_) break;
+        const uint4 four = sums_of(sums, row, kGated ? 1 : 0);
         const unsigned words[4] = {four.x, four.y, four.z, four.w};
         if constexpr (kGated) {
-          const uint4 others = sums_of(sums, first + kRowsAtOnce * i, 0);
+          const uint4 others = sums_of(sums, row, 0);
           const unsigned gates[4] = {others.x, others.y, others.z, others.w};
 #pragma unroll
           for (int c = 0; c < 4; ++c) gate[i].of[c] = dev::add(value(of[i], gates[c], c), gate_bias.of[c]);
@@ -168,25 +194,21 @@ class TileEnd {
 #pragma unroll
         for (int c = 0; c < 4; ++c)
           y.of[c] = cuda::finish(e_, kGated || e_.gate != nullptr, value(of[i], words[c], c), bias.of[c], factor.of[c],
-                                 gate[i].of[c], residual[i].of[c]);
-        store(row0_ + first + kRowsAtOnce * i, y);
+                                 gate[i].of[c], residual[i].of[c], activate);
+        store(row0_ + row, y, kTogether || together_);
       }
     }
   }
-
- private:
-  static constexpr int kQuads = kColumns / 4 / (kGated ? 2 : 1), kRowsAtOnce = kColumns * 2 / kQuads, kBatch = 4;
-
   VLA_DEVICE uint4 sums_of(const std::byte* sums, int row, int half) const {
     return dev::read<uint4>(sums + (row * (kColumns + 4) + (half * kQuads + thread_index() % kQuads) * 4) * 4);
   }
-  VLA_DEVICE void store(std::int64_t row, const Four& y) const {
+  VLA_DEVICE void store(std::int64_t row, const Four& y, bool together) const {
     const std::int64_t at = row * e_.y_stride + column_;
-    if (e_.is_bf16) return store_four(static_cast<std::uint16_t*>(e_.y) + at, y, together_, n_);
+    if (e_.is_bf16) return store_four(static_cast<std::uint16_t*>(e_.y) + at, y, together, n_);
     const unsigned words[4] = {
         static_cast<unsigned>(dev::bits_of(y.of[0])), static_cast<unsigned>(dev::bits_of(y.of[1])),
         static_cast<unsigned>(dev::bits_of(y.of[2])), static_cast<unsigned>(dev::bits_of(y.of[3]))};
-    store_four(static_cast<unsigned*>(e_.y) + at, words, together_, n_);
+    store_four(static_cast<unsigned*>(e_.y) + at, words, together, n_);
   }
 
   const Epilogue& e_;

@@ -165,38 +165,43 @@ VLA_EARLY_KERNEL(linear_bf16_128, 128, 2, LinearBf16Job) { multiply<Shape128>(jo
 VLA_EARLY_KERNEL(linear_bf16_64, 128, 4, LinearBf16Job) { multiply<Shape64>(job); }
 VLA_KERNEL(linear_bf16_few, 128, 4, LinearBf16Job) { multiply_few(job); }
 
+namespace {
+
+/// Two adjacent sums of all shares of the depth, from column `at` of a row of them on, added in order. All are asked
+/// for before any is added.
+VLA_DEVICE float2 add_shares(const LinearBf16Job& job, int row, int at, bool has_second) {
+  const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * job.n_sum();
+  const float* from = job.partial + static_cast<std::int64_t>(row) * job.n_sum() + at;
+  float2 sum = {0, 0};
+  if (job.n_split > kMostSplits || !has_second || (job.n_sum() | at) % 2 != 0) {
+#pragma unroll 1
+    for (int z = 0; z < job.n_split; ++z, from += apart) {
+      sum.x += from[0];
+      if (has_second) sum.y += from[1];
+    }
+    return sum;
+  }
+  float2 share[kMostSplits];
+#pragma unroll
+  for (int z = 0; z < kMostSplits; ++z)
+    share[z] = z < job.n_split ? *reinterpret_cast<const float2*>(from + z * apart) : float2{0, 0};
+#pragma unroll
+  for (int z = 0; z < kMostSplits; ++z) sum.x += share[z].x, sum.y += share[z].y;
+  return sum;
+}
+
+}  // namespace
+
 /// Adds the partial sums of a split and computes y.
 VLA_KERNEL(linear_bf16_finish, 128, 4, LinearBf16Job) {
   const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 2;
   if (column >= job.n_column) return;
   PairEnds ends = load_ends(job.end, row, column, job.n_column);
-  const auto add = [&](int at) {
-    const bool is_pair = ends.has_second && (job.n_sum() | at) % 2 == 0;
-    const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * job.n_sum();
-    const float* from = job.partial + static_cast<std::int64_t>(row) * job.n_sum() + at;
-    float2 share[kMostSplits], sum = {0, 0};
-#pragma unroll
-    for (int z = 0; z < kMostSplits; ++z) {  // all are asked for before any is added
-      share[z] = {0, 0};
-      if (z >= job.n_split) continue;
-      if (is_pair)
-        share[z] = *reinterpret_cast<const float2*>(from + z * apart);
-      else
-        share[z] = {from[z * apart], ends.has_second ? from[z * apart + 1] : 0};
-    }
-#pragma unroll
-    for (int z = 0; z < kMostSplits; ++z) sum.x += share[z].x, sum.y += share[z].y;
-    for (int z = kMostSplits; z < job.n_split; ++z) {
-      sum.x += from[z * apart];
-      if (ends.has_second) sum.y += from[z * apart + 1];
-    }
-    return sum;
-  };
+  const float2 sum = add_shares(job, row, job.n_sum() - job.n_column + column, ends.has_second);
   if (job.gate_weight) {
-    ends.gate = add(column), ends.has_gate = true;
+    ends.gate = add_shares(job, row, column, ends.has_second), ends.has_gate = true;
     add_gate_bias(job, ends, column);
   }
-  const float2 sum = add(job.n_sum() - job.n_column + column);
   finish_pair(job.end, ends, sum.x, sum.y, row, column);
 }
 
