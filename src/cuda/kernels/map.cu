@@ -6,26 +6,49 @@
 
 namespace vla::cuda {
 
-/// A thread computes four elements, 256 apart, so that accesses of a warp are coalesced.
-VLA_KERNEL(map_elements, 256, 4, MapJob) {
-  const std::int64_t n = job.count();
-  for (int k = 0; k < 4; ++k) {
-    std::int64_t rest = static_cast<std::int64_t>(blockIdx.x) * 1024 + k * 256 + thread_index();
-    if (rest >= n) return;
-    std::int64_t a = 0, b = 0, y = 0;
+namespace {
+
+/// kAtOnce of a thread's elements, 256 apart, so that accesses of a warp are coalesced. All are asked for before any is
+/// used. Index: one that is divided fast, where all elements have such.
+template <int kAtOnce, class Index>
+VLA_DEVICE void map(const MapJob& job, Index first, Index n) {
+  float a[kAtOnce], b[kAtOnce];
+  std::int64_t to[kAtOnce];
+#pragma unroll
+  for (int k = 0; k < kAtOnce; ++k) {
+    Index rest = first + static_cast<Index>(k * 256);
+    if (rest >= n) break;
+    std::int64_t of_a = 0, of_b = 0;
+    to[k] = 0;
 #pragma unroll
     for (int d = 0; d < MapJob::kDims; ++d) {
-      const std::int64_t i = rest % job.size[d];
-      rest /= job.size[d];
-      a += i * job.a_step[d], b += i * job.b_step[d], y += i * job.y_step[d];
+      const auto size = static_cast<Index>(job.size[d]);
+      const auto i = static_cast<std::int64_t>(rest % size);
+      rest /= size;
+      of_a += i * job.a_step[d], of_b += i * job.b_step[d], to[k] += i * job.y_step[d];
     }
-    float value = job.a[a];
-    if (job.operation == MapOperation::add) value = dev::add(value, job.b[b]);
-    if (job.operation == MapOperation::multiply) value = dev::multiply(value, job.b[b]);
+    a[k] = job.a[of_a], b[k] = job.b ? job.b[of_b] : 0;
+  }
+#pragma unroll
+  for (int k = 0; k < kAtOnce; ++k) {
+    if (first + static_cast<Index>(k * 256) >= n) break;
+    float value = a[k];
+    if (job.operation == MapOperation::add) value = dev::add(value, b[k]);
+    if (job.operation == MapOperation::multiply) value = dev::multiply(value, b[k]);
     value = activate(job.activation, value);
     if (job.factor != 1) value = dev::multiply(value, job.factor);  // a copy keeps all bits
-    store(job.y, job.is_bf16, y, value);
+    store(job.y, job.is_bf16, to[k], value);
   }
+}
+
+}  // namespace
+
+/// A thread computes four elements.
+VLA_KERNEL(map_elements, 256, 4, MapJob) {
+  const std::int64_t n = job.count(), first = static_cast<std::int64_t>(blockIdx.x) * 1024 + thread_index();
+  if (n < 1U << 31) return map<4>(job, static_cast<unsigned>(first), static_cast<unsigned>(n));
+#pragma unroll 1
+  for (int k = 0; k < 4; ++k) map<1>(job, first + k * 256, n);
 }
 
 }  // namespace vla::cuda
