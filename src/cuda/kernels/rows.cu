@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "cuda/kernels/rows.h"
 
-#include "cuda/kernels/device.h"
+#include "cuda/kernels/finish.h"
 
 namespace vla::cuda {
 namespace {
@@ -58,19 +58,15 @@ VLA_DEVICE void store_codes(std::byte* y, int n, std::byte* room, Value value) {
   store_scale(y + depth, s, across_warps(sum_of_warp(sum), room, sum_of));
 }
 
-/// Four adjacent values of a row, zeros behind its end. `whole`: all rows consist of aligned fours.
-VLA_DEVICE void load_four(float (&to)[4], const float* row, int i, int n, bool whole) {
-  if (whole && i < n) {
-    const float4 four = *reinterpret_cast<const float4*>(row + i);
-    to[0] = four.x, to[1] = four.y, to[2] = four.z, to[3] = four.w;
-  } else {
-    for (int k = 0; k < 4; ++k) to[k] = i + k < n ? row[i + k] : 0;
-  }
+/// Four adjacent values of a whole row, or `otherwise` behind its end and where there is no row.
+VLA_DEVICE void load_four(float (&to)[4], const float* row, int i, int n, float otherwise) {
+  float4 four = {otherwise, otherwise, otherwise, otherwise};
+  if (row && i < n) four = *reinterpret_cast<const float4*>(row + i);
+  to[0] = four.x, to[1] = four.y, to[2] = four.z, to[3] = four.w;
 }
-VLA_DEVICE bool is_aligned(const void* p, int bytes) { return reinterpret_cast<std::uint64_t>(p) % bytes == 0; }
 
 /// One reduction of a block; each has room of its own, so that one barrier is enough.
-constexpr int kReductionRoom = 32;
+constexpr int kReductionRoom = 64;
 template <class T, class Combine>
 VLA_DEVICE T reduce(T of_warp, int number, Combine combine) {
   return across_warps(of_warp, dev::shared_memory() + number * kReductionRoom, combine);
@@ -79,52 +75,99 @@ VLA_DEVICE float sum_of_block(float x, int number) {
   return reduce(sum_of_warp(x), number, [](float a, float b) { return a + b; });
 }
 
-/// The same for a row in registers.
-template <int kGroups>
+/// The same for a whole row in registers.
+template <int kThreads, int kGroups>
 VLA_DEVICE void store_codes(std::byte* y, int n, const float (&x)[kGroups][4]) {
   const int depth = (n + 63) / 64 * 64;
+  const auto place = [](int j) { return 4 * (thread_index() + kThreads * j); };
   int most = 0;  // values after the row's end are 0, or NaN if the row has one
 #pragma unroll
   for (int j = 0; j < kGroups; ++j)
 #pragma unroll
     for (int k = 0; k < 4; ++k)
-      if (4 * (thread_index() + kNormThreads * j) + k < n) most = larger(size_of(x[j][k]), most);
+      if (place(j) < n) most = larger(size_of(x[j][k]), most);
   const float s = scale_of(reduce(most_of_warp(most), 2, larger));
   int sum = 0;
 #pragma unroll
   for (int j = 0; j < kGroups; ++j) {
-    const int i = 4 * (thread_index() + kNormThreads * j);
     unsigned four = 0;
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
-      const unsigned code = i + k < n ? code_of(x[j][k], s) : 0;
+      const unsigned code = place(j) < n ? code_of(x[j][k], s) : 0;
       four |= code << 8 * k, sum += as_signed(code);
     }
-    if (i < depth) *reinterpret_cast<unsigned*>(y + i) = four;
+    if (place(j) < depth) *reinterpret_cast<unsigned*>(y + place(j)) = four;
   }
   store_scale(y + depth, s, reduce(sum_of_warp(sum), 3, sum_of));
 }
 
-/// A row of up to kGroups * 1024 values in registers, four adjacent ones of each 1024 in a thread, so that all that is
-/// read is asked for at once.
+/// What a row's norm is of, in fours: loads all of them before it computes any. x + residual:
 template <int kGroups>
-VLA_DEVICE void norm_in_registers(const NormJob& job) {
-  const std::int64_t row = blockIdx.x;
+class Added {
+ public:
+  VLA_DEVICE void load(const NormJob& job, std::int64_t row, int j, int i) {
+    load_four(x_[j], job.x + row * job.x_stride, i, job.n, 0);
+    load_four(residual_[j], job.residual ? job.residual + row * job.n : nullptr, i, job.n, kAddsNothing);
+  }
+  VLA_DEVICE float value(int j, int k) const { return x_[j][k] + residual_[j][k]; }
+
+ private:
+  float x_[kGroups][4], residual_[kGroups][4];
+};
+/// A product of shares of its depth:
+template <int kGroups>
+class Finished {
+ public:
+  VLA_DEVICE void load(const LinearBf16Job& job, std::int64_t row, int j, int i) {
+    const int n = job.n_column;
+    const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * n;
+#pragma unroll
+    for (int z = 0; z < kMostFinishedSplits; ++z)
+      load_four(share_[j][z], z < job.n_split ? job.partial + z * apart + row * n : nullptr, i, n, 0);
+    load_four(bias_[j], job.end.bias, i, n, kAddsNothing);
+    load_four(factor_[j], job.end.factor, i, n, kScalesNothing);
+    load_four(residual_[j], job.end.residual ? job.end.residual + row * n : nullptr, i, n, kAddsNothing);
+  }
+  VLA_DEVICE float value(int j, int k) const {
+    float sum = 0;
+#pragma unroll
+    for (int z = 0; z < kMostFinishedSplits; ++z) sum += share_[j][z][k];
+    return dev::add(dev::multiply(dev::add(sum, bias_[j][k]), factor_[j][k]), residual_[j][k]);
+  }
+
+ private:
+  float share_[kGroups][kMostFinishedSplits][4], bias_[kGroups][4], factor_[kGroups][4], residual_[kGroups][4];
+};
+
+/// Writes four adjacent values of a normalized row.
+VLA_DEVICE void store_four(const NormJob& job, std::int64_t row, int i, const float (&x)[4]) {
+  const std::int64_t to = row * job.y_stride + i;
+  if (i >= job.n) return;
+  if (job.type == RowType::bf16)
+    *reinterpret_cast<uint2*>(static_cast<std::uint16_t*>(job.y) + to) =
+        uint2{dev::to_bf16(x[0], x[1]), dev::to_bf16(x[2], x[3])};
+  else
+    *reinterpret_cast<float4*>(static_cast<float*>(job.y) + to) = float4{x[0], x[1], x[2], x[3]};
+}
+
+/// Norms a row of up to 4 kGroups values of each of kThreads threads, in registers, `thread` being this one's number.
+/// All that is read is asked for at once. of: Added or Finished, of operands `from`. sum_of_row(x, number): over those
+/// threads, the first and the second of a row. store(x): what is done with the normalized row.
+template <int kGroups, int kThreads, class Of, class From, class Sum, class Store>
+VLA_DEVICE void norm_in_registers(const NormJob& job, std::int64_t row, int thread, Of of, const From& from,
+                                  Sum sum_of_row, Store store) {
   const int n = job.n;
-  const bool whole = n % 4 == 0 && job.x_stride % 4 == 0 && is_aligned(job.x, 16) && is_aligned(job.residual, 16) &&
-                     is_aligned(job.sum, 16) && is_aligned(job.weight, 16) && is_aligned(job.bias, 16);
-  const auto place = [](int j) { return 4 * (thread_index() + kNormThreads * j); };
+  const auto place = [&](int j) { return 4 * (thread + kThreads * j); };
   // Weights have registers where a row takes few; else they are read when they are used.
   constexpr bool kEarly = kGroups <= 2;
-  float x[kGroups][4], residual[kGroups][4], weight[kGroups][4], bias[kGroups][4];
+  float x[kGroups][4], weight[kGroups][4], bias[kGroups][4];
   const auto load_weights = [&](int j) {
-    if (job.weight) load_four(weight[j], job.weight, place(j), n, whole);
-    if (job.bias) load_four(bias[j], job.bias, place(j), n, whole);
+    load_four(weight[j], job.weight, place(j), n, kScalesNothing);
+    load_four(bias[j], job.bias, place(j), n, kAddsNothing);
   };
 #pragma unroll
   for (int j = 0; j < kGroups; ++j) {
-    load_four(x[j], job.x + row * job.x_stride, place(j), n, whole);
-    if (job.residual) load_four(residual[j], job.residual + row * n, place(j), n, whole);
+    of.load(from, row, j, place(j));
     if (kEarly) load_weights(j);
   }
   float sum = 0;
@@ -132,56 +175,67 @@ VLA_DEVICE void norm_in_registers(const NormJob& job) {
   for (int j = 0; j < kGroups; ++j) {
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
-      if (job.residual) x[j][k] += residual[j][k];
+      x[j][k] = place(j) < n ? of.value(j, k) : 0;
       sum += x[j][k];
-      if (job.sum && !whole && place(j) + k < n) job.sum[row * n + place(j) + k] = x[j][k];
     }
-    if (job.sum && whole && place(j) < n)
+    if (job.sum && place(j) < n)
       *reinterpret_cast<float4*>(job.sum + row * n + place(j)) = float4{x[j][0], x[j][1], x[j][2], x[j][3]};
   }
   float mean = 0, factor = 1;
-  if (job.norm == RowNorm::layer) mean = sum_of_block(sum, 0) / static_cast<float>(n);
+  if (job.norm == RowNorm::layer) mean = sum_of_row(sum, 0) / static_cast<float>(n);
   if (job.norm != RowNorm::none) {
     float squares = 0;
 #pragma unroll
     for (int j = 0; j < kGroups; ++j)
 #pragma unroll
-      for (int k = 0; k < 4; ++k) squares += place(j) + k < n ? (x[j][k] - mean) * (x[j][k] - mean) : 0;
-    factor = 1 / sqrtf(sum_of_block(squares, 1) / static_cast<float>(n) + job.eps);
+      for (int k = 0; k < 4; ++k) squares += place(j) < n ? (x[j][k] - mean) * (x[j][k] - mean) : 0;
+    factor = 1 / sqrtf(sum_of_row(squares, 1) / static_cast<float>(n) + job.eps);
   }
 #pragma unroll
   for (int j = 0; j < kGroups; ++j) {
     if (!kEarly) load_weights(j);
 #pragma unroll
-    for (int k = 0; k < 4; ++k) {
-      x[j][k] = dev::multiply(x[j][k] - mean, factor);
-      if (job.weight) x[j][k] = dev::multiply(x[j][k], weight[j][k]);
-      if (job.bias) x[j][k] = dev::add(x[j][k], bias[j][k]);
-    }
+    for (int k = 0; k < 4; ++k)
+      x[j][k] = dev::add(dev::multiply(dev::multiply(x[j][k] - mean, factor), weight[j][k]), bias[j][k]);
   }
-  if (job.type == RowType::codes) return store_codes(static_cast<std::byte*>(job.y) + row * job.y_stride, n, x);
-  const bool stores_four = n % 4 == 0 && job.y_stride % 4 == 0 && is_aligned(job.y, 16);
+  store(x);
+}
+
+/// The row of a block.
+template <int kGroups, int kThreads = 256, class Of, class From>
+VLA_DEVICE void norm_of_block(const NormJob& job, Of of, const From& from) {
+  const std::int64_t row = blockIdx.x;
+  norm_in_registers<kGroups, kThreads>(
+      job, row, thread_index(), of, from, [](float x, int number) { return sum_of_block(x, number); },
+      [&](const float(&x)[kGroups][4]) {
+        if (job.type == RowType::codes)
+          return store_codes<kThreads>(static_cast<std::byte*>(job.y) + row * job.y_stride, job.n, x);
 #pragma unroll
-  for (int j = 0; j < kGroups; ++j) {
-    const std::int64_t to = row * job.y_stride + place(j);
-    if (place(j) >= n) continue;
-    if (!stores_four) {
-      for (int k = 0; k < 4; ++k)
-        if (place(j) + k < n) store(job.y, job.type == RowType::bf16, to + k, x[j][k]);
-    } else if (job.type == RowType::bf16) {
-      *reinterpret_cast<uint2*>(static_cast<std::uint16_t*>(job.y) + to) =
-          uint2{dev::to_bf16(x[j][0], x[j][1]), dev::to_bf16(x[j][2], x[j][3])};
-    } else {
-      *reinterpret_cast<float4*>(static_cast<float*>(job.y) + to) = float4{x[j][0], x[j][1], x[j][2], x[j][3]};
-    }
-  }
+        for (int j = 0; j < kGroups; ++j) store_four(job, row, 4 * (thread_index() + kThreads * j), x[j]);
+      });
 }
 
 }  // namespace
 
-VLA_KERNEL(norm_rows_2, 256, 4, NormJob) { norm_in_registers<2>(job); }
-VLA_KERNEL(norm_rows_4, 256, 3, NormJob) { norm_in_registers<4>(job); }
-VLA_KERNEL(norm_rows_8, 256, 2, NormJob) { norm_in_registers<8>(job); }
+VLA_KERNEL(norm_rows_2, 256, 4, NormJob) { norm_of_block<2>(job, Added<2>{}, job); }
+VLA_KERNEL(norm_rows_4, 256, 3, NormJob) { norm_of_block<4>(job, Added<4>{}, job); }
+VLA_KERNEL(norm_rows_8, 512, 2, NormJob) { norm_of_block<4, 512>(job, Added<4>{}, job); }
+VLA_KERNEL(finish_norm_rows_1, 256, 2, FinishNormJob) { norm_of_block<1>(job.norm, Finished<1>{}, job.product); }
+VLA_KERNEL(finish_norm_rows_2, 256, 2, FinishNormJob) { norm_of_block<2>(job.norm, Finished<2>{}, job.product); }
+
+/// The row of a warp.
+VLA_KERNEL(norm_many_rows, 128, 4, NormJob) {
+  constexpr int kGroups = kOfWarp / 4 / kLanes;
+  const int lane = thread_index() % kLanes;
+  const std::int64_t row = static_cast<std::int64_t>(blockIdx.x) * kRowsOfBlock + thread_index() / kLanes;
+  if (row >= job.n_row) return;  // the whole warp
+  norm_in_registers<kGroups, kLanes>(
+      job, row, lane, Added<kGroups>{}, job, [](float x, int) { return sum_of_warp(x); },
+      [&](const float(&x)[kGroups][4]) {
+#pragma unroll
+        for (int j = 0; j < kGroups; ++j) store_four(job, row, 4 * (lane + kLanes * j), x[j]);
+      });
+}
 
 /// A block computes one row, which stays in shared memory if it fits.
 VLA_KERNEL(norm_rows, 256, 4, NormJob) {

@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include "cuda/kernels/launch.h"
+#include "cuda/kernels/linear_bf16.h"
 
 /// Kernels that work on one row at a time: norms, codes, rotations and table lookups.
 namespace vla::cuda {
@@ -25,17 +25,44 @@ struct NormJob {
   RowType type;
 };
 constexpr int kMaxKept = 24576;  // wider rows are read again; narrower ones stay in shared memory
-constexpr int kNormThreads = 256;
+/// Many rows have a warp each, which has no barrier to wait at.
+constexpr int kManyRows = 1024, kOfWarp = 1024, kRowsOfBlock = 4;
+inline bool is_aligned(const void* p) { return reinterpret_cast<std::uint64_t>(p) % 16 == 0; }
+/// Whether rows consist of aligned fours.
+inline bool is_whole(const NormJob& job) {
+  return (job.n | job.x_stride | job.y_stride) % 4 == 0 && is_aligned(job.x) && is_aligned(job.residual) &&
+         is_aligned(job.sum) && is_aligned(job.weight) && is_aligned(job.bias) && is_aligned(job.y);
+}
 inline Launch norm_rows(const NormJob& job) {
-  if (job.n <= 8192)  // a row in registers
-    return {job.n <= 2048   ? "norm_rows_2"
-            : job.n <= 4096 ? "norm_rows_4"
-                            : "norm_rows_8",
-            {static_cast<unsigned>(job.n_row)},
-            kNormThreads,
-            128};
-  const int n_kept = job.n <= kMaxKept ? job.n : 0;
-  return {"norm_rows", {static_cast<unsigned>(job.n_row)}, 256, static_cast<unsigned>(n_kept * 4 + 64)};
+  const auto n_row = static_cast<unsigned>(job.n_row);
+  if (!is_whole(job) || job.n > 8192) {
+    const int n_kept = job.n <= kMaxKept ? job.n : 0;
+    return {"norm_rows", {n_row}, 256, static_cast<unsigned>(n_kept * 4 + 64)};
+  }
+  if (job.n_row >= kManyRows && job.n <= kOfWarp && job.type != RowType::codes)
+    return {"norm_many_rows", {blocks(job.n_row, kRowsOfBlock)}, 32 * kRowsOfBlock};
+  if (job.n > 4096) return {"norm_rows_8", {n_row}, 512, 256};
+  return {job.n <= 2048 ? "norm_rows_2" : "norm_rows_4", {n_row}, 256, 256};
+}
+
+/// y = norm(v) for the v of a product whose depth is split into up to kMostFinishedSplits, of up to kMostFinished
+/// columns: adds the shares as finish_bf16_partial does, without an activation, a gate and a last ReLU. v goes to
+/// norm.sum. Rows consist of aligned fours.
+struct FinishNormJob {
+  LinearBf16Job product;
+  NormJob norm;  // without x and residual
+};
+constexpr int kMostFinished = 2048, kMostFinishedSplits = 8;
+inline bool is_whole(const FinishNormJob& job) {
+  const Epilogue& end = job.product.end;
+  return is_whole(job.norm) && is_aligned(job.product.partial) && is_aligned(end.bias) && is_aligned(end.factor) &&
+         is_aligned(end.residual);
+}
+inline Launch finish_norm_rows(const FinishNormJob& job) {
+  return {job.norm.n <= 1024 ? "finish_norm_rows_1" : "finish_norm_rows_2",
+          {static_cast<unsigned>(job.norm.n_row)},
+          256,
+          256};
 }
 
 /// Rows of heads: an RMS norm over the head if there is a weight, then a rotation of the pairs (x_i, x_{i + d_head/2})

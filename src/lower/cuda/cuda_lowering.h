@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <memory>
+
 #include "cuda/kernels/attention.h"
 #include "lower/cuda/cuda_queue.h"
 #include "lower/cuda/cuda_weights.h"
@@ -48,6 +50,9 @@ struct CudaOp : Step {
   AttentionPlan plan = {};  // of an AttentionOp
   ValueId gate = kNone;     // the gate product's result, if no kernel computes gate and up together
   ValueId partial = kNone;  // partial results of the shares of the depth or of the keys
+  /// Of a norm: the product whose shares of the depth it adds first, which therefore leaves them.
+  std::shared_ptr<const CudaOp> finishes = nullptr;
+  bool leaves_shares = false;
 };
 
 struct CudaLowering : Lowering {
@@ -75,7 +80,7 @@ struct CudaLowering : Lowering {
 
 /// Makes operands readable for the kernels: copies those of the wrong layout, converts inputs of bf16 and int8
 /// products, norms and rotates heads before attention (which reads keys and values in place, or as bf16). A value with
-/// only such readers is stored rounded. Also splits the depth of products.
+/// only such readers is stored rounded. Also splits the depth of products, and has norms add its shares.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 
 /// The strip width, 16 to 64, for several products in one launch without split depth.

@@ -33,6 +33,8 @@ class CudaLayouts final : Layouts {
     for (CudaOp& op : l.ops)
       if (auto* head = std::get_if<HeadOp>(&op.op)) round_heads_at_once(op, head->rows);
     std::erase_if(l.ops, [](const CudaOp& op) { return op.writes.empty(); });
+    for (CudaOp& op : l.ops)
+      if (const auto* round = std::get_if<RoundOp>(&op.op)) finish_in_norm(op, *round);
   }
 
  private:
@@ -127,6 +129,37 @@ class CudaLayouts final : Layouts {
     maker->writes[0] = add_rows(rows_of_product, DType::bf16);
     l.value(to).base = maker->writes[0];
     head.writes.clear();
+  }
+  /// Has the norm of a product's result add the product's shares of the depth, if it is the first that reads it: one
+  /// kernel less in a layer's chain.
+  void finish_in_norm(CudaOp& norm, const RoundOp& what) {
+    const Value& x = l.value(what.x);
+    const bool is_whole = x.base == what.x && x.placement == Value::Placement::arena && !is_tapped(what.x);
+    if (what.norm == nullptr || !is_whole || x.shape[0] > cuda::kMostFinished) return;
+    const auto maker =
+        std::find_if(l.ops.begin(), l.ops.end(), [&](const CudaOp& op) { return op.writes[0] == what.x; });
+    if (maker == l.ops.end() || !leaves_plain_shares(*maker)) return;
+    const auto reads_first = [&](const CudaOp& op) {
+      return std::pair(op.order, &op) < std::pair(norm.order, static_cast<const CudaOp*>(&norm)) &&
+             std::any_of(op.reads.begin(), op.reads.end(), [&](ValueId id) { return l.value(id).base == what.x; });
+    };
+    if (std::any_of(l.ops.begin(), l.ops.end(), reads_first)) return;
+    norm.finishes = std::make_shared<const CudaOp>(*maker);
+    maker->writes = {maker->partial}, maker->leaves_shares = true;
+    std::replace(norm.reads.begin(), norm.reads.end(), what.x, maker->partial);
+    const auto& product = std::get<LinearOp>(maker->op);
+    for (const ValueId id : {product.factor, product.residual})
+      if (id != kNone) norm.reads.push_back(id);
+    norm.writes.push_back(what.x);
+  }
+  /// Whether an operation is a product of one bf16 matrix in shares of the depth, without what cuda::FinishNormJob
+  /// lacks.
+  bool leaves_plain_shares(const CudaOp& op) const {
+    const auto* product = std::get_if<LinearOp>(&op.op);
+    return product != nullptr && product->linears.size() == 1 && op.partial != kNone && !op.leaves_shares &&
+           op.cut.n_split <= cuda::kMostFinishedSplits && l.matrix(*product->linears[0]).kind == MatrixKind::bf16 &&
+           l.value(op.writes[0]).type == DType::f32 && product->activation == Activation::none &&
+           !product->ends_in_relu;
   }
   /// Whether a value or a view of it is tapped.
   bool is_tapped(ValueId base) const {
