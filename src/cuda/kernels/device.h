@@ -104,6 +104,9 @@ VLA_DEVICE void multiply_bf16(float (&sum)[4], const unsigned (&a)[4], unsigned 
 /// sum + the dot product of the four signed bytes of a and b.
 VLA_DEVICE int dot4(unsigned a, unsigned b, int sum) { return __dp4a(static_cast<int>(a), static_cast<int>(b), sum); }
 
+/// Has the cache line at an address brought to the L2 cache; no access to what is there.
+VLA_DEVICE void prefetch(const void* p) { asm volatile("prefetch.global.L2 [%0];" ::"l"(p)); }
+
 /// The value of the lane whose index differs in the bits of `mask`.
 template <class T>
 VLA_DEVICE T shuffle_xor(T value, int mask) {
@@ -159,10 +162,10 @@ constexpr int kLanes = 32;
 
 /// Calls run(job, block of the job) for the job that has this block.
 template <class Job, class Run>
-VLA_DEVICE void run_one(const Several<Job>& jobs, Run run) {
+VLA_DEVICE void run_one(const Several<Job>& jobs, unsigned block, Run run) {
   int i = 0;
-  while (i + 1 < jobs.n && blockIdx.x >= jobs.end[i]) ++i;
-  run(jobs.job[i], static_cast<int>(i == 0 ? blockIdx.x : blockIdx.x - jobs.end[i - 1]));
+  while (i + 1 < jobs.n && block >= jobs.end[i]) ++i;
+  run(jobs.job[i], static_cast<int>(i == 0 ? block : block - jobs.end[i - 1]));
 }
 
 VLA_DEVICE int thread_index() { return static_cast<int>(threadIdx.x); }

@@ -16,9 +16,9 @@ struct Tile {
 };
 
 template <class T>
-VLA_DEVICE void multiply(const LinearBf16Job& job) {
+VLA_DEVICE void multiply(const LinearBf16Job& job, int block) {
   std::byte* shared = dev::shared_memory();
-  const int row0 = static_cast<int>(blockIdx.x) * T::kRows, column0 = static_cast<int>(blockIdx.y) * T::kColumnsY;
+  const int row0 = static_cast<int>(blockIdx.x) * T::kRows, column0 = block * T::kColumnsY;
   const int n_step = (job.depth + kHopperDepth - 1) / kHopperDepth, z = static_cast<int>(blockIdx.z);
   const int first = n_step * z / job.n_split, n = n_step * (z + 1) / job.n_split - first;
   // Rows of the gate's matrix come first.
@@ -86,15 +86,22 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
 
 #define VLA_HOPPER_KERNEL(columns, rows)                                                   \
   VLA_EARLY_KERNEL(hopper_linear_bf16_##columns##x##rows, columns * 2, 1, LinearBf16Job) { \
-    multiply<Tile<columns, rows, false>>(job);                                             \
+    multiply<Tile<columns, rows, false>>(job, static_cast<int>(blockIdx.y));               \
   }
 VLA_HOPPER_TILES(VLA_HOPPER_KERNEL)
 #undef VLA_HOPPER_KERNEL
 #define VLA_HOPPER_KERNEL(columns, rows)                                                           \
   VLA_EARLY_KERNEL(hopper_linear_bf16_##columns##x##rows##_gated, columns * 2, 1, LinearBf16Job) { \
-    multiply<Tile<columns, rows, true>>(job);                                                      \
+    multiply<Tile<columns, rows, true>>(job, static_cast<int>(blockIdx.y));                        \
   }
 VLA_HOPPER_GATED_TILES(VLA_HOPPER_KERNEL)
+#undef VLA_HOPPER_KERNEL
+#define VLA_HOPPER_KERNEL(columns, rows)                                                                    \
+  VLA_EARLY_KERNEL(hopper_linears_bf16_##columns##x##rows, columns * 2, 1, Several<LinearBf16Job>) {        \
+    run_one(job, blockIdx.y,                                                                                \
+            [](const LinearBf16Job& one, int block) { multiply<Tile<columns, rows, false>>(one, block); }); \
+  }
+VLA_HOPPER_SEVERAL_TILES(VLA_HOPPER_KERNEL)
 #undef VLA_HOPPER_KERNEL
 
 }  // namespace vla::cuda

@@ -33,7 +33,8 @@ constexpr unsigned kHopperShared = 227 << 10;
 /// Most blocks of a grid in y and z.
 constexpr unsigned kMaxGridYZ = 65535;
 
-/// Up to so many jobs of one kernel in one launch; blocks of a job end, in x, where the next one's begin.
+/// Up to so many jobs of one kernel in one launch; blocks of a job end, in x or for Hopper's tiles in y, where the next
+/// one's begin.
 constexpr int kMostJobs = 3;
 template <class Job>
 struct Several {

@@ -190,11 +190,9 @@ VLA_DEVICE float2 add_shares(const LinearBf16Job& job, int row, int at, bool has
   return sum;
 }
 
-}  // namespace
-
 /// Adds the partial sums of a split and computes y.
-VLA_KERNEL(linear_bf16_finish, 128, 4, LinearBf16Job) {
-  const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 2;
+VLA_DEVICE void finish_partial(const LinearBf16Job& job, int block) {
+  const int row = static_cast<int>(blockIdx.y), column = (block * 128 + thread_index()) * 2;
   if (column >= job.n_column) return;
   PairEnds ends = load_ends(job.end, row, column, job.n_column);
   const float2 sum = add_shares(job, row, job.n_sum() - job.n_column + column, ends.has_second);
@@ -203,6 +201,13 @@ VLA_KERNEL(linear_bf16_finish, 128, 4, LinearBf16Job) {
     add_gate_bias(job, ends, column);
   }
   finish_pair(job.end, ends, sum.x, sum.y, row, column);
+}
+
+}  // namespace
+
+VLA_KERNEL(linear_bf16_finish, 128, 4, LinearBf16Job) { finish_partial(job, static_cast<int>(blockIdx.x)); }
+VLA_KERNEL(linear_bf16_finishes, 128, 4, Several<LinearBf16Job>) {
+  run_one(job, blockIdx.x, [](const LinearBf16Job& one, int block) { finish_partial(one, block); });
 }
 
 }  // namespace vla::cuda

@@ -84,10 +84,13 @@ inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
 }
 
 /// Tiles of kernels for Hopper alone (hopper_linear_bf16.cu): columns, a multiple of 64, and rows, a multiple of 16.
-#define VLA_HOPPER_TILES(each)                                                                                       \
-  each(64, 64) each(64, 128) each(128, 64) each(128, 96) each(128, 112) each(128, 128) each(128, 144) each(128, 160) \
-      each(128, 176) each(128, 192) each(128, 224) each(128, 256) each(192, 112) each(192, 160) each(192, 192)       \
-          each(192, 224) each(256, 112) each(256, 128) each(256, 160)
+/// Those that have a kernel for several products in one launch too:
+#define VLA_HOPPER_SEVERAL_TILES(each) \
+  each(64, 64) each(128, 64) each(128, 96) each(128, 112) each(128, 128) each(128, 192) each(192, 112) each(192, 192)
+#define VLA_HOPPER_OTHER_TILES(each)                                                                      \
+  each(64, 128) each(128, 144) each(128, 160) each(128, 176) each(128, 224) each(128, 256) each(192, 160) \
+      each(192, 224) each(256, 112) each(256, 128) each(256, 160)
+#define VLA_HOPPER_TILES(each) VLA_HOPPER_SEVERAL_TILES(each) VLA_HOPPER_OTHER_TILES(each)
 /// The same for both matrices of a gated product, of each of which a tile has half of its columns.
 #define VLA_HOPPER_GATED_TILES(each)                                                                      \
   each(128, 96) each(128, 128) each(128, 160) each(128, 192) each(128, 224) each(128, 256) each(256, 112) \
@@ -95,14 +98,19 @@ inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
 struct HopperTile {
   const char* kernel;
   int columns, rows;
-  bool is_gated;
+  bool is_gated = false;
+  const char* several = nullptr;  // the kernel of several products
 };
 constexpr HopperTile kHopperTiles[] = {
-#define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_bf16_" #columns "x" #rows, columns, rows, false},
-    VLA_HOPPER_TILES(VLA_HOPPER_TILE)
+#define VLA_HOPPER_TILE(columns, rows) \
+  {"hopper_linear_bf16_" #columns "x" #rows, columns, rows, false, "hopper_linears_bf16_" #columns "x" #rows},
+    VLA_HOPPER_SEVERAL_TILES(VLA_HOPPER_TILE)
+#undef VLA_HOPPER_TILE
+#define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_bf16_" #columns "x" #rows, columns, rows},
+        VLA_HOPPER_OTHER_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 #define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_bf16_" #columns "x" #rows "_gated", columns, rows, true},
-        VLA_HOPPER_GATED_TILES(VLA_HOPPER_TILE)
+            VLA_HOPPER_GATED_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 };
 constexpr int kHopperDepth = 64;  // step of the depth, and unit of a split: each has one at least
@@ -120,9 +128,22 @@ inline Launch hopper_linear_bf16(const HopperTile& tile, const LinearBf16Job& jo
           static_cast<unsigned>(tile.columns) * 2,
           static_cast<unsigned>(hopper_stages(tile.columns, tile.rows) * hopper_stage_bytes(tile.columns, tile.rows))};
 }
+/// Several products of the same rows, depth and number of shares, without gates.
+inline Launch hopper_linears_bf16(const HopperTile& tile, Several<LinearBf16Job>& jobs) {
+  Launch launch = hopper_linear_bf16(tile, jobs.job[0]);
+  unsigned n_block = 0;
+  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = n_block += blocks(jobs.job[i].n_column, tile.columns);
+  launch.kernel = tile.several, launch.grid.y = n_block;
+  return launch;
+}
 
 inline Launch finish_bf16_partial(const LinearBf16Job& job) {
   return {"linear_bf16_finish", {blocks(job.n_column, 256), static_cast<unsigned>(job.n_row)}, 128};
+}
+inline Launch finish_bf16_partials(Several<LinearBf16Job>& jobs) {
+  unsigned n_block = 0;
+  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = n_block += finish_bf16_partial(jobs.job[i]).grid.x;
+  return {"linear_bf16_finishes", {n_block, static_cast<unsigned>(jobs.job[0].n_row)}, 128};
 }
 
 }  // namespace vla::cuda

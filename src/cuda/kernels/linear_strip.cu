@@ -167,9 +167,10 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job, int block) {
   VLA_EARLY_KERNEL(linear_strip_##name, 256, 1, LinearBf16Job) {           \
     multiply_strip<Strip<__VA_ARGS__>>(job, static_cast<int>(blockIdx.x)); \
   }
-#define VLA_STRIPS(name, ...)                                                                                  \
-  VLA_EARLY_KERNEL(linear_strips_##name, 256, 1, Several<LinearBf16Job>) {                                     \
-    run_one(job, [](const LinearBf16Job& one, int block) { multiply_strip<Strip<__VA_ARGS__>>(one, block); }); \
+#define VLA_STRIPS(name, ...)                                                                             \
+  VLA_EARLY_KERNEL(linear_strips_##name, 256, 1, Several<LinearBf16Job>) {                                \
+    run_one(job, blockIdx.x,                                                                              \
+            [](const LinearBf16Job& one, int block) { multiply_strip<Strip<__VA_ARGS__>>(one, block); }); \
   }
 VLA_STRIP(16, 2, 1, false)
 VLA_STRIP(32, 4, 1, false)

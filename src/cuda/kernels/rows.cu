@@ -275,33 +275,47 @@ VLA_KERNEL(norm_rows, 256, 4, NormJob) {
     store(job.y, job.type == RowType::bf16, row * job.y_stride + i, normed(i));
 }
 
-/// A warp computes a row of a head; a lane the pairs (i, i + d_head / 2) of every 32nd i.
+/// A warp computes a row of a head; a lane the pairs (i, i + d_head / 2) of every 32nd i, kAtOnce of which it asks for
+/// at once.
 VLA_DEVICE void turn_heads(const HeadJob& job, int block) {
+  constexpr int kAtOnce = 4;
   const int lane = thread_index() % kLanes, half = job.d_head / 2;
-  const std::int64_t number = static_cast<std::int64_t>(block) * 4 + thread_index() / kLanes;
-  if (number >= static_cast<std::int64_t>(job.n_head) * job.n_token * job.n_batch) return;  // the whole warp
+  const int number = block * 4 + thread_index() / kLanes;
+  if (number >= job.n_head * job.n_token * job.n_batch) return;  // the whole warp
   const std::int64_t head = number % job.n_head, token = number / job.n_head % job.n_token,
                      batch = number / job.n_head / job.n_token;
   const float* x = job.x + head * job.x_head + token * job.x_token + batch * job.x_batch;
+  const float* table = job.table ? job.table + token * job.d_head : nullptr;
   float factor = 1;
   if (job.weight) {
     float squares = 0;
     for (int i = lane; i < job.d_head; i += kLanes) squares += x[i] * x[i];
     factor = 1 / sqrtf(sum_of_warp(squares) / static_cast<float>(job.d_head) + job.eps);
   }
-  const auto normed = [&](int i) { return job.weight ? x[i] * factor * job.weight[i] : x[i]; };
+  const auto normed = [&](float value, int i) { return job.weight ? value * factor * job.weight[i] : value; };
   const std::int64_t to = head * job.y_head + token * job.y_token + batch * job.y_batch;
-  for (int i = lane; i < half; i += kLanes) {
-    const float low = normed(i), high = normed(i + half);
-    const float cosine = job.table ? job.table[token * job.d_head + i] : 1;
-    const float sine = job.table ? job.table[token * job.d_head + half + i] : 0;
-    store(job.y, job.is_bf16, to + i, low * cosine - high * sine);
-    store(job.y, job.is_bf16, to + i + half, high * cosine + low * sine);
+#pragma unroll 1
+  for (int first = lane; first < half; first += kLanes * kAtOnce) {
+    float low[kAtOnce] = {}, high[kAtOnce] = {}, cosine[kAtOnce] = {}, sine[kAtOnce] = {};
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) {
+      const int i = first + kLanes * k;
+      if (i >= half) break;
+      low[k] = normed(x[i], i), high[k] = normed(x[i + half], i + half);
+      cosine[k] = table ? table[i] : 1, sine[k] = table ? table[half + i] : 0;
+    }
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) {
+      const int i = first + kLanes * k;
+      if (i >= half) break;
+      store(job.y, job.is_bf16, to + i, low[k] * cosine[k] - high[k] * sine[k]);
+      store(job.y, job.is_bf16, to + i + half, high[k] * cosine[k] + low[k] * sine[k]);
+    }
   }
 }
 VLA_KERNEL(head_rows, 128, 4, HeadJob) { turn_heads(job, static_cast<int>(blockIdx.x)); }
 VLA_KERNEL(several_head_rows, 128, 4, Several<HeadJob>) {
-  run_one(job, [](const HeadJob& one, int block) { turn_heads(one, block); });
+  run_one(job, blockIdx.x, [](const HeadJob& one, int block) { turn_heads(one, block); });
 }
 
 VLA_KERNEL(lookup_rows, 128, 8, LookupJob) {

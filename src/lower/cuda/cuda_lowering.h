@@ -85,9 +85,12 @@ void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 
 /// The strip width, 16 to 64, for several products in one launch without split depth.
 unsigned common_width(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
-/// The Hopper tile with the shortest estimated time.
-ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, bool is_gated,
-                          int n_sm);
+/// Which tables of Hopper's tiles a product may be cut by: those of both matrices of a gated product, or of several
+/// products in one launch.
+enum class HopperCutFor { one, gated, several };
+/// The Hopper tile with the shortest estimated time. n_column: of all products together.
+ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
+                          HopperCutFor what, int n_sm);
 /// is_gated: one kernel computes gate and up, which have n_column columns together.
 ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
                        std::int64_t depth, bool is_gated);

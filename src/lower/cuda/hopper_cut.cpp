@@ -58,12 +58,13 @@ struct Candidate {
   std::int64_t columns, rows, step_bytes;
 };
 
-std::vector<Candidate> candidates(MatrixKind kind, bool is_gated) {
+std::vector<Candidate> candidates(MatrixKind kind, HopperCutFor what) {
   std::vector<Candidate> all;
   if (kind == MatrixKind::bf16)
     for (std::size_t i = 0; i < std::size(cuda::kHopperTiles); ++i) {
-      const auto& [kernel, columns, rows, gated] = cuda::kHopperTiles[i];
-      if (gated == is_gated) all.push_back({i, columns, rows, (columns + rows) * 128});
+      const auto& [kernel, columns, rows, is_gated, several] = cuda::kHopperTiles[i];
+      if (is_gated != (what == HopperCutFor::gated) || (what == HopperCutFor::several && several == nullptr)) continue;
+      all.push_back({i, columns, rows, (columns + rows) * 128});
     }
   const bool is_ternary = kind == MatrixKind::ternary;
   if (is_ternary || kind == MatrixKind::int8)
@@ -79,12 +80,12 @@ std::int64_t ceil_of(std::int64_t n, std::int64_t size) { return (n + size - 1) 
 
 }  // namespace
 
-ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth, bool is_gated,
-                          int n_sm) {
+ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
+                          HopperCutFor what, int n_sm) {
   const std::int64_t n_step = ceil_of(depth, kind == MatrixKind::bf16 ? cuda::kHopperDepth : cuda::kHopperInt8Depth);
   const Rates& rates = kind == MatrixKind::bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
   ProductCut best = {ProductShape::hopper, 1, 0, std::numeric_limits<double>::max()};
-  for (const Candidate& tile : candidates(kind, is_gated))
+  for (const Candidate& tile : candidates(kind, what))
     for (const int n_split : {1, 2, 3, 4, 6, 8}) {
       if (n_split > 1 && n_step / n_split < 4) break;
       const auto size = static_cast<double>(tile.columns * tile.rows);

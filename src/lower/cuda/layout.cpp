@@ -33,6 +33,9 @@ class CudaLayouts final : Layouts {
     for (CudaOp& op : l.ops)
       if (auto* head = std::get_if<HeadOp>(&op.op)) round_heads_at_once(op, head->rows);
     std::erase_if(l.ops, [](const CudaOp& op) { return op.writes.empty(); });
+    for (std::size_t i = 0; i < l.ops.size(); ++i) cut_together(i);
+    for (CudaOp& op : l.ops)
+      if (const auto* product = std::get_if<LinearOp>(&op.op)) split(op, op.cut.n_split, n_sum(op, *product));
     for (CudaOp& op : l.ops)
       if (const auto* round = std::get_if<RoundOp>(&op.op)) finish_in_norm(op, *round);
   }
@@ -71,8 +74,7 @@ class CudaLayouts final : Layouts {
     const Shape y = op.linears[0]->shape;
     const std::int64_t depth = l.value(op.x).shape[0], n_row = count(y) / y[0];
     const bool is_one = op.gated && multiplies_both(op, n_row);
-    const std::int64_t n_column = is_one ? 2 * y[0] : y[0];
-    const ProductCut cut = cut_product(l, kind, n_row, n_column, depth, is_one);
+    const ProductCut cut = cut_product(l, kind, n_row, is_one ? 2 * y[0] : y[0], depth, is_one);
     if (kind == MatrixKind::ternary || kind == MatrixKind::int8)
       round(step, op, DType::i8, kernels::quantized_stride(depth), "round");
     else if (kind == MatrixKind::bf16 && cut.shape != ProductShape::few)
@@ -83,7 +85,40 @@ class CudaLayouts final : Layouts {
     const bool has_gate = op.gated && !is_one;
     CudaOp& made = l.ops.emplace_back(CudaOp{std::move(step), std::move(op), cut});
     if (has_gate) made.writes.push_back(made.gate = add_rows(y));
-    split(made, cut.n_split, n_column * n_row);
+  }
+  /// Sums of a share of the depth.
+  static std::int64_t n_sum(const CudaOp& op, const LinearOp& product) {
+    return count(product.linears[0]->shape) * (product.gated && op.gate == kNone ? 2 : 1);
+  }
+  /// Whether an operation is a product of one bf16 matrix that reads nothing but x.
+  bool is_plain_product(const CudaOp& op) const {
+    const auto* product = std::get_if<LinearOp>(&op.op);
+    return product != nullptr && product->linears.size() == 1 && op.reads.size() == 1 &&
+           l.matrix(*product->linears[0]).kind == MatrixKind::bf16 && op.cut.shape != ProductShape::few;
+  }
+  /// Cuts the first plain product of an x and the next ones of it, as q, k and v, alike, so that merge_calls makes one
+  /// launch of them.
+  void cut_together(std::size_t first) {
+    std::vector<std::size_t> all;
+    for (std::size_t i = 0; i < l.ops.size() && all.size() < cuda::kMostJobs; ++i)
+      if (is_plain_product(l.ops[i]) && l.ops[i].reads == l.ops[first].reads) all.push_back(i);
+    if (all.size() < 2 || all[0] != first) return;
+    const auto columns_of = [&](std::size_t i) { return std::get<LinearOp>(l.ops[i].op).linears[0]->shape[0]; };
+    std::int64_t n_column = 0;
+    double apart = 0;
+    for (const std::size_t i : all) n_column += columns_of(i), apart += l.ops[i].cut.us;
+    const auto& product = std::get<LinearOp>(l.ops[first].op);
+    const Shape& y = product.linears[0]->shape;
+    const std::int64_t n_row = count(y) / y[0], depth = l.value(product.x).shape[0];
+    ProductCut cut = cut_product(l, MatrixKind::bf16, n_row, n_column, depth, false);
+    if (cut.shape == ProductShape::hopper)
+      cut = cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::several, l.n_sm);
+    const bool is_one_launch = cut.shape == ProductShape::hopper || (strip_width(cut.shape) > 0 && cut.n_split == 1);
+    if (!is_one_launch || cut.us >= apart) return;
+    for (const std::size_t i : all) {
+      l.ops[i].cut = cut;
+      l.ops[i].cut.us *= static_cast<double>(columns_of(i)) / static_cast<double>(n_column);
+    }
   }
   /// Whether one block computes columns of both gate and up.
   bool multiplies_both(const LinearOp& op, std::int64_t n_row) const {
@@ -228,15 +263,16 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
   const int n_sm = l.n_sm;
   const bool is_bf16 = kind == MatrixKind::bf16, is_few = n_row <= (is_bf16 ? cuda::kBf16FewRows : 4);
   const bool has_tiles = l.is_hopper && kind != MatrixKind::f32 && !is_few;
+  const HopperCutFor tables = is_gated ? HopperCutFor::gated : HopperCutFor::one;
   if (is_bf16 && is_of_strips(n_row, depth)) {
     const ProductCut strips = cut_in_strips(n_row, n_column, depth, n_sm);
     if (!has_tiles) return strips;
     // Strips of q, k and v are one launch; tiles run on forked streams.
     constexpr double kFork = 1;
-    const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, is_gated, n_sm);
+    const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
     return tiles.us + kFork < strips.us ? tiles : strips;
   }
-  if (has_tiles && n_row > 64) return cut_for_hopper(kind, n_row, n_column, depth, is_gated, n_sm);
+  if (has_tiles && n_row > 64) return cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
   const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
   const ProductShape shape = is_few                          ? ProductShape::few
                              : n_row > 64 && n_large >= n_sm ? ProductShape::rows128

@@ -32,41 +32,68 @@ bool is_strip(const Calls& calls) {
   return job.n_split == 1 && job.gate_weight == nullptr;
 }
 bool is_heads(const Calls& calls) { return calls.size() == 1 && calls[0].how.kernel == std::string_view("head_rows"); }
+/// The Hopper tile of a bf16 product that leaves no shares to another operation, if it has a kernel of several.
+const cuda::HopperTile* tile_of(const Calls& calls) {
+  const auto* tile = std::find_if(std::begin(cuda::kHopperTiles), std::end(cuda::kHopperTiles),
+                                  [&](const auto& one) { return calls[0].how.kernel == std::string_view(one.kernel); });
+  if (tile == std::end(cuda::kHopperTiles) || tile->several == nullptr) return nullptr;
+  return (job_of<cuda::LinearBf16Job>(calls[0]).n_split > 1) == (calls.size() == 2) ? tile : nullptr;
+}
 
-/// Merges operations for which `fits` holds and `agrees` with the first, up to kMost at a time.
-template <class Job, class Fits, class Agrees, class Launch>
-void merge(std::vector<Calls>& phase, Fits fits, Agrees agrees, Launch launch) {
+/// Merges operations for which `fits` holds and `agrees` with the first, up to kMostJobs at a time. `merged` makes the
+/// calls of several, of which it fills in where each job ends.
+template <class Job, class Fits, class Agrees, class Merged>
+void merge(std::vector<Calls>& phase, Fits fits, Agrees agrees, Merged merged) {
   for (std::size_t first = 0; first < phase.size(); ++first) {
     if (!fits(phase[first])) continue;
     cuda::Several<Job> several = {};
     several.job[several.n++] = job_of<Job>(phase[first][0]);
     for (std::size_t i = first + 1; i < phase.size() && several.n < cuda::kMostJobs;) {
-      if (!fits(phase[i]) || !agrees(several.job[0], job_of<Job>(phase[i][0]))) {
+      if (!fits(phase[i]) || !agrees(phase[first], phase[i])) {
         ++i;
         continue;
       }
       several.job[several.n++] = job_of<Job>(phase[i][0]);
       phase.erase(phase.begin() + static_cast<std::ptrdiff_t>(i));
     }
-    if (several.n == 1) continue;
-    const cuda::Launch how = launch(several);  // fills in where each job ends
-    phase[first] = {call_of(how, several)};
+    if (several.n > 1) phase[first] = merged(phase[first], several);
   }
+}
+
+/// Whether two products have the same rows, depth and number of shares.
+bool are_alike(const Calls& a, const Calls& b) {
+  const auto one = job_of<cuda::LinearBf16Job>(a[0]), other = job_of<cuda::LinearBf16Job>(b[0]);
+  return one.n_row == other.n_row && one.depth == other.depth && one.n_split == other.n_split;
 }
 
 }  // namespace
 
 void merge_calls(std::vector<Calls>& phase, int n_sm) {
+  using Products = cuda::Several<cuda::LinearBf16Job>;
+  merge<cuda::LinearBf16Job>(phase, is_strip, are_alike, [&](const Calls&, Products& jobs) {
+    std::int64_t n_column = 0;
+    for (int i = 0; i < jobs.n; ++i) n_column += jobs.job[i].n_column;
+    const unsigned width = common_width(jobs.job[0].n_row, n_column, jobs.job[0].depth, n_sm);
+    const cuda::Launch how = cuda::linear_strips(width, jobs);
+    return Calls{call_of(how, jobs)};
+  });
   merge<cuda::LinearBf16Job>(
-      phase, is_strip, [](const auto& a, const auto& b) { return a.n_row == b.n_row && a.depth == b.depth; },
-      [&](cuda::Several<cuda::LinearBf16Job>& jobs) {
-        std::int64_t n_column = 0;
-        for (int i = 0; i < jobs.n; ++i) n_column += jobs.job[i].n_column;
-        return cuda::linear_strips(common_width(jobs.job[0].n_row, n_column, jobs.job[0].depth, n_sm), jobs);
+      phase, [](const Calls& calls) { return tile_of(calls) != nullptr; },
+      [](const Calls& a, const Calls& b) { return tile_of(a) == tile_of(b) && are_alike(a, b); },
+      [](const Calls& first, Products& jobs) {
+        const cuda::Launch product = cuda::hopper_linears_bf16(*tile_of(first), jobs);
+        Calls calls = {call_of(product, jobs)};
+        if (jobs.job[0].n_split == 1) return calls;
+        const cuda::Launch finish = cuda::finish_bf16_partials(jobs);
+        calls.push_back(call_of(finish, jobs));
+        return calls;
       });
   merge<cuda::HeadJob>(
-      phase, is_heads, [](const auto&, const auto&) { return true; },
-      [](cuda::Several<cuda::HeadJob>& jobs) { return cuda::several_head_rows(jobs); });
+      phase, is_heads, [](const Calls&, const Calls&) { return true; },
+      [](const Calls&, cuda::Several<cuda::HeadJob>& jobs) {
+        const cuda::Launch how = cuda::several_head_rows(jobs);
+        return Calls{call_of(how, jobs)};
+      });
 }
 
 }  // namespace vla::lower
