@@ -1,6 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
+#include <deque>
 
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/products.h"
@@ -63,4 +64,44 @@ TEST_CASE("bf16 products in tiles for Hopper are as near to doubles") {
     }
   }
   CHECK(counts.bank_conflicts == 0);
+}
+
+TEST_CASE("several products in tiles for Hopper are what each is alone, to the bit") {
+  if (!is_hopper()) {
+    MESSAGE("skipped: no device of compute capability 9.0");
+    return;
+  }
+  for (const HopperTile& tile : kHopperTiles)
+    for (const int n_split : {1, 3}) {
+      if (tile.several == nullptr) continue;
+      INFO(tile.several, ", ", n_split, " shares");
+      constexpr int kRows = 70, kDepth = 200, kColumns[] = {130, 64, 200};
+      Numbers numbers;
+      const Device<std::uint16_t> x(bf16_rows(numbers.floats(kRows * kDepth), kDepth, kDepth));
+      std::deque<Device<std::uint16_t>> weights;
+      std::deque<Device<float>> partials, together, alone;
+      Several<LinearBf16Job> jobs = {};
+      for (const int n_column : kColumns) {
+        weights.emplace_back(bf16_rows(numbers.floats(n_column * kDepth), kDepth, kDepth));
+        partials.emplace_back(static_cast<std::size_t>(n_split * kRows * n_column));
+        for (auto* all : {&together, &alone}) all->emplace_back(static_cast<std::size_t>(kRows * n_column));
+        LinearBf16Job& job = jobs.job[jobs.n++];
+        job = {.x = x.get(), .weight = weights.back().get(), .x_stride = kDepth, .weight_stride = kDepth};
+        job.n_row = kRows, job.n_column = n_column, job.depth = kDepth, job.n_split = n_split;
+        job.partial = n_split > 1 ? partials.back().get() : nullptr;
+        job.end.y = alone.back().get(), job.end.y_stride = n_column;
+        launch(hopper_linear_bf16(tile, job), job);
+        if (n_split > 1) launch(finish_bf16_partial(job), job);
+        job.end.y = together.back().get();
+      }
+      in_every_schedule([&] {
+        const Launch product = hopper_linears_bf16(tile, jobs);
+        launch(product, jobs);
+        if (n_split > 1) {
+          const Launch finish = finish_bf16_partials(jobs);
+          launch(finish, jobs);
+        }
+        for (std::size_t i = 0; i < alone.size(); ++i) CHECK(together[i].host() == alone[i].host());
+      });
+    }
 }

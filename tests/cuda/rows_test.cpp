@@ -4,6 +4,9 @@
 
 #include <doctest/doctest.h>
 
+#include <set>
+#include <string>
+
 #include "cuda/kernels/map.h"
 #include "cuda/machine.h"
 #include "cuda/numbers.h"
@@ -50,33 +53,70 @@ std::vector<std::byte> quantized(const std::vector<float>& x, std::int64_t n) {
 }  // namespace
 
 TEST_CASE("norms of a sum are within 2e-6 of doubles, and the sum is what was added") {
-  for (RowNorm kind : {RowNorm::layer, RowNorm::rms, RowNorm::none})
+  const std::set<std::string> kernels = {"norm_rows", "norm_rows_2", "norm_rows_4", "norm_rows_8", "norm_many_rows"};
+  std::set<std::string> seen;
+  const auto check = [&](RowNorm kind, int n, int n_row, int stride) {
+    INFO("norm ", static_cast<int>(kind), " of ", n_row, " x ", n, ", stride ", stride);
+    Numbers numbers;
+    const std::vector<float> x = numbers.floats(n_row * stride), residual = numbers.floats(n_row * n);
+    const std::vector<float> weight = numbers.floats(n), bias = numbers.floats(n);
+    std::vector<float> both;
+    for (int i = 0; i < n_row * n; ++i)
+      both.push_back(x[static_cast<std::size_t>(i / n * stride + i % n)] + residual[static_cast<std::size_t>(i)]);
+    const Device<float> gx(x), gresidual(residual), gweight(weight), gbias(bias), sum(both.size()), y(both.size());
+    const Device<std::uint16_t> half(both.size());
+    NormJob job = {gx.get(), gresidual.get(), sum.get(), gweight.get(), gbias.get(), y.get(),     stride,
+                   n,        n_row,           n,         1e-6f,         kind,        RowType::f32};
+    seen.insert(norm_rows(job).kernel);
+    in_every_schedule([&] {
+      launch(norm_rows(job), job);
+      CHECK(sum.host() == both);
+      CHECK(error(y.host(), normed(both, weight, bias, job)) < 2e-6);
+    });
+    job.y = half.get(), job.type = RowType::bf16, job.bias = nullptr;
+    launch(norm_rows(job), job);
+    CHECK(widened(half.host()) != y.host());
+    CHECK(error(widened(half.host()), normed(both, weight, bias, job)) < 4e-3);
+  };
+  for (RowNorm kind : {RowNorm::layer, RowNorm::rms, RowNorm::none}) {
     for (int n : {2, 31, 256, 1000, 2560, 6912,
                   kind == RowNorm::layer ? kMaxKept
                   : kind == RowNorm::rms ? kMaxKept + 1
-                                         : 3}) {
-      INFO("norm ", static_cast<int>(kind), " of ", n);
-      Numbers numbers;
-      const int n_row = 3, stride = n + 5;
-      const std::vector<float> x = numbers.floats(n_row * stride), residual = numbers.floats(n_row * n);
-      const std::vector<float> weight = numbers.floats(n), bias = numbers.floats(n);
-      std::vector<float> both;
-      for (int i = 0; i < n_row * n; ++i)
-        both.push_back(x[static_cast<std::size_t>(i / n * stride + i % n)] + residual[static_cast<std::size_t>(i)]);
-      const Device<float> gx(x), gresidual(residual), gweight(weight), gbias(bias), sum(both.size()), y(both.size());
-      const Device<std::uint16_t> half(both.size());
-      NormJob job = {gx.get(), gresidual.get(), sum.get(), gweight.get(), gbias.get(), y.get(),     stride,
-                     n,        n_row,           n,         1e-6f,         kind,        RowType::f32};
-      in_every_schedule([&] {
-        launch(norm_rows(job), job);
-        CHECK(sum.host() == both);
-        CHECK(error(y.host(), normed(both, weight, bias, job)) < 2e-6);
-      });
-      job.y = half.get(), job.type = RowType::bf16, job.bias = nullptr;
-      launch(norm_rows(job), job);
-      CHECK(widened(half.host()) != y.host());
-      CHECK(error(widened(half.host()), normed(both, weight, bias, job)) < 4e-3);
-    }
+                                         : 3})
+      for (int behind : {5, 8}) check(kind, n, 3, n + behind);
+    check(kind, 36, kManyRows + 2, 40);
+  }
+  check(RowNorm::layer, kOfWarp, kManyRows, kOfWarp);
+  CHECK(seen == kernels);
+}
+
+TEST_CASE("a norm adds the shares of a product as the kernel that does nothing else") {
+  for (const int n : {720, 1024, 2048})
+    for (const int n_split : {2, kMostFinishedSplits})
+      for (const bool has_all : {false, true}) {
+        INFO(n, " columns, ", n_split, " shares");
+        Numbers numbers;
+        const int n_row = 5;
+        const Device<float> partial(numbers.floats(n * n_row * n_split)), residual(numbers.floats(n * n_row));
+        const Device<float> bias(numbers.floats(n)), factor(numbers.floats(n)), weight(numbers.floats(n));
+        const Device<float> v(static_cast<std::size_t>(n * n_row)), y(static_cast<std::size_t>(n * n_row));
+        FinishNormJob job = {};
+        job.product = {.n_row = n_row, .n_column = n, .n_split = n_split, .partial = partial.get()};
+        Epilogue& end = job.product.end;
+        end.y = v.get(), end.y_stride = n;
+        if (has_all) end.bias = bias.get(), end.factor = factor.get(), end.residual = residual.get();
+        job.norm = {.sum = v.get(), .weight = has_all ? weight.get() : nullptr, .y = y.get(), .y_stride = n};
+        job.norm.n_row = n_row, job.norm.n = n, job.norm.eps = 1e-6f, job.norm.norm = RowNorm::rms;
+        launch(finish_bf16_partial(job.product), job.product);
+        const std::vector<float> sums = v.host();
+        const std::vector<double> expected = normed(sums, weight.host(), {}, job.norm);
+        in_every_schedule([&] {
+          CHECK(is_whole(job));
+          launch(finish_norm_rows(job), job);
+          CHECK(v.host() == sums);
+          CHECK(error(y.host(), expected) < 2e-6);
+        });
+      }
 }
 
 TEST_CASE("codes of rows are the CPU's to the bit") {
