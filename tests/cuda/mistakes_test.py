@@ -180,7 +180,7 @@ MISTAKES = {
         "sum.x += share[z].x, sum.y += share[z].y;",
         "sum.x += (z == 1 ? 2 : 1) * share[z].x, sum.y += share[z].y;",
     ),
-    "the gate is not activated": ("finish.h", "linear_bf16", "activate(e.activation, gate)", "gate"),
+    "the gate is not activated": ("finish.h", "linear_bf16", "activate(has_gate ? gate : sum)", "has_gate ? gate : activate(sum)"),
     "the factor comes after the residual": (
         "finish.h",
         "linear_bf16",
@@ -190,8 +190,8 @@ MISTAKES = {
     "the last ReLU comes before the residual": (
         "finish.h",
         "linear_bf16",
-        "if (e.residual) sum =",
-        "if (e.ends_in_relu) sum = activate(Activation::relu, sum);\n  if (e.residual) return",
+        "sum = dev::add(sum, residual);\n",
+        "if (e.ends_in_relu && sum < 0) sum = 0;\n  return dev::add(sum, residual);\n",
     ),
     "no barrier before x is written again": (
         "linear_f32.cu",
@@ -317,6 +317,12 @@ MISTAKES = {
         "hopper_linear_bf16",
         "if constexpr (T::kGated) fetch_gate(stage, step);\n    fetch_matrix(stage + (T::kColumns - T::kColumnsY) * kSwizzledRow, step);",
         "fetch_matrix(stage, step);\n    if constexpr (T::kGated) fetch_gate(stage + T::kColumnsY * kSwizzledRow, step);",
+    ),
+    "every product's columns begin at the first one's": (
+        "device.h",
+        "hopper_linear_bf16",
+        "block - jobs.end[i - 1]",
+        "block",
     ),
     "a share of the gate's sums in the place of another": (
         "hopper_tile.h",
@@ -488,18 +494,25 @@ MISTAKES = {
         "sqrtf(sum_of_block(squares, room) / static_cast<float>(n) + job.eps)",
         "(sqrtf(sum_of_block(squares, room) / static_cast<float>(n)) + 100 * job.eps)",
     ),
+    "a norm leaves out the last share": (
+        "rows.cu",
+        "rows",
+        "z < kMostFinishedSplits; ++z) sum +=",
+        "z + 1 < kMostFinishedSplits; ++z) sum +=",
+    ),
+    "a warp norms a row behind the last": ("rows.cu", "rows", "if (row >= job.n_row) return;  // the whole warp", ""),
     "a wide row is kept all the same": ("rows.cu", "rows", "const bool is_kept = n <= kMaxKept;", "const bool is_kept = true;"),
     "a wide row without what was added": ("rows.cu", "rows", ": load(i); };", ": job.x[row * job.x_stride + i]; };"),
-    "heads turn the other way": ("rows.cu", "rows", "low * cosine - high * sine", "low * cosine + high * sine"),
+    "heads turn the other way": ("rows.cu", "rows", "low[k] * cosine[k] - high[k] * sine[k]", "low[k] * cosine[k] + high[k] * sine[k]"),
     "the table's row of another token": (
         "rows.cu",
         "rows",
-        "job.table[token * job.d_head + i]",
-        "job.table[head * job.d_head + i]",
+        "job.table + token * job.d_head",
+        "job.table + head * job.d_head",
     ),
     "an id outside of the table": ("rows.cu", "rows", "id >= 0 && id < job.n_table;", "id < job.n_table;"),
     "steps of another operand": ("map.cu", "map", "b += i * job.b_step[d]", "b += i * job.a_step[d]"),
-    "elements behind the last": ("map.cu", "map", "if (rest >= n) return;", ""),
+    "elements behind the last": ("map.cu", "map", "if (rest >= n) break;", ""),
     # Windows over images.
     "pixels of the line above": ("window.cu", "window", "column >= job.width || row < 0", "row < 0"),
     "pixels behind the last line": ("window.cu", "window", " || row >= job.height)", ")"),

@@ -6,6 +6,7 @@ namespace vla::cuda {
 namespace {
 
 constexpr int kWarps = 8, kThreads = kWarps * kLanes, kStripRows = 64, kTilesM = kStripRows / 16;
+constexpr int kAhead = 3;  // steps of a warp that are under way: all of a depth of 768
 
 /// A block has kColumns columns of sums of up to 64 rows, half of them the gate's where there is one. Its warps have
 /// kTilesN * 8 of the columns each, and take the depth's steps in turn with those that have the same columns.
@@ -131,18 +132,19 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job, int block) {
   const Share share(job);
   const Operands<S> operands(job, row0, column0, of_warp);
 
-  typename Operands<S>::Step ahead[2];
+  typename Operands<S>::Step ahead[kAhead];
   const int first = share.first + of_k;
 #pragma unroll
-  for (int i = 0; i < 2; ++i) operands.load_weight(ahead[i], first + i * S::kWarpsK);
+  for (int i = 0; i < kAhead; ++i) operands.load_weight(ahead[i], first + i * S::kWarpsK);
   dev::wait_for_earlier();
 #pragma unroll
-  for (int i = 0; i < 2; ++i) operands.load_x(ahead[i], first + i * S::kWarpsK);
+  for (int i = 0; i < kAhead; ++i) operands.load_x(ahead[i], first + i * S::kWarpsK);
   float sum[kTilesM][S::kTilesN][4] = {};
-  for (int step = first; step < share.end; step += 2 * S::kWarpsK) {
+#pragma unroll 1
+  for (int step = first; step < share.end; step += kAhead * S::kWarpsK) {
 #pragma unroll
-    for (int i = 0; i < 2; ++i) {
-      const int now = step + i * S::kWarpsK, next = now + 2 * S::kWarpsK;
+    for (int i = 0; i < kAhead; ++i) {
+      const int now = step + i * S::kWarpsK, next = now + kAhead * S::kWarpsK;
       if (now < share.end) ahead[i].multiply(sum);
       if (next < share.end) operands.load_weight(ahead[i], next), operands.load_x(ahead[i], next);
     }
