@@ -34,7 +34,8 @@ struct Size {
 // Of a chunk's end, of steps of a few rows, of action experts, of language models and of vision towers.
 constexpr Size kSizes[] = {{50, 720, 32},     {1, 2048, 2048},   {4, 960, 2560},     {50, 720, 2048},
                            {50, 1024, 4096},  {113, 960, 2560},  {642, 2560, 2560},  {642, 2560, 6912},
-                           {642, 6912, 2560}, {512, 1152, 4304}, {560, 16384, 2048}, {968, 2048, 16384}};
+                           {642, 6912, 2560}, {512, 1152, 4304}, {560, 16384, 2048}, {968, 2048, 16384},
+                           {2048, 768, 3072}};
 constexpr int kSplits[] = {1, 2, 4, 8};
 /// More than the largest cache of a GPU.
 constexpr std::size_t kBeyondCaches = 200u << 20;
@@ -131,6 +132,7 @@ class Bench {
   Status run_hopper(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Buffer& partial,
                     const Epilogue& end) {
     const std::int64_t stride = round_up(size.depth, 8);
+    VLA_TRY(const Buffer bias, timer_.upload(numbers_.floats(size.n_column)));
     for (const HopperTile& tile : kHopperTiles)
       for (const int n_split : {1, 2, 3, 4, 6, 8}) {
         // Both matrices of a gated product, each of half of the columns, are as much work.
@@ -145,7 +147,12 @@ class Bench {
         }
         std::vector<Launch> launches = {hopper_linear_bf16(tile, jobs[0])};
         if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
-        VLA_CHECK(tell("bf16", size, tile.kernel, n_split, jobs, launches));
+        VLA_CHECK(tell(tile.is_gated ? "bf16 gated" : "bf16", size, tile.kernel, n_split, jobs, launches));
+        if (tile.is_gated || n_split > 1 || size.n_row <= 64) continue;
+        // What a vision tower's first product of an MLP ends in.
+        for (LinearBf16Job& job : jobs)
+          job.end.bias = bias.as<float>(), job.end.activation = Activation::gelu_tanh, job.end.is_bf16 = true;
+        VLA_CHECK(tell("bf16, GELU", size, tile.kernel, n_split, jobs, launches));
       }
     return {};
   }
