@@ -512,7 +512,7 @@ MISTAKES = {
     ),
     "an id outside of the table": ("rows.cu", "rows", "id >= 0 && id < job.n_table;", "id < job.n_table;"),
     "steps of another operand": ("map.cu", "map", "b += i * job.b_step[d]", "b += i * job.a_step[d]"),
-    "elements behind the last": ("map.cu", "map", "if (rest >= n) break;", ""),
+    "the last element is left out": ("map.cu", "map", "n = job.count(), first", "n = job.count() - 1, first"),
     # Windows over images.
     "pixels of the line above": ("window.cu", "window", "column >= job.width || row < 0", "row < 0"),
     "pixels behind the last line": ("window.cu", "window", " || row >= job.height)", ")"),
