@@ -95,14 +95,20 @@ def processor(result):
     return table([f"on its {result.get('processor', 'processor')}", "threads", "network, ms"], rows)
 
 
-def section(result):
-    return "\n".join([title(result), *families(result), *kernels(result), *products(result), *processor(result)]) + "\n"
+def section(result, is_newest):
+    """Of a visit: what it ran and acts; of a card's newest one, its kernels and products too."""
+    details = [*kernels(result), *products(result)] if is_newest else []
+    return "\n".join([title(result), *families(result), *details, *processor(result)]) + "\n"
 
 
 def block(results):
     """Of all visits, the newest first."""
     newest = sorted(results, key=lambda result: result["date"], reverse=True)
-    return "\n".join(map(section, newest)) or "No GPU was measured yet.\n"
+    seen, sections = set(), []
+    for result in newest:
+        sections.append(section(result, result["card"] not in seen))
+        seen.add(result["card"])
+    return "\n".join(sections) or "No GPU was measured yet.\n"
 
 
 def written(root):
