@@ -303,4 +303,13 @@ TEST_CASE("patches of images are rows of channel, row and column") {
             ((view * 3 + channel) * height + patch / columns * size + row) * width + patch % columns * size + column)]);
       }
   CHECK(y.host() == expected);
+  const Device<float> in_parts(pixels.size());
+  MapJobs parts = {};
+  for (int view = 0; view < n_view; ++view) {
+    MapJob& part = parts.job[parts.n++] = job;
+    part.size[5] = 1, part.a += view * width * height * 3, part.y = in_parts.get() + view * width * height * 3;
+  }
+  const Launch how = map_parts(parts);
+  launch(how, parts);
+  CHECK(in_parts.host() == expected);
 }

@@ -161,8 +161,8 @@ namespace vla::cuda {
 constexpr int kLanes = 32;
 
 /// Calls run(job, block of the job) for the job that has this block.
-template <class Job, class Run>
-VLA_DEVICE void run_one(const Several<Job>& jobs, unsigned block, Run run) {
+template <class Job, int kMost, class Run>
+VLA_DEVICE void run_one(const Several<Job, kMost>& jobs, unsigned block, Run run) {
   int i = 0;
   while (i + 1 < jobs.n && block >= jobs.end[i]) ++i;
   run(jobs.job[i], static_cast<int>(i == 0 ? block : block - jobs.end[i - 1]));

@@ -36,10 +36,10 @@ constexpr unsigned kMaxGridYZ = 65535;
 /// Up to so many jobs of one kernel in one launch; blocks of a job end, in x or for Hopper's tiles in y, where the next
 /// one's begin.
 constexpr int kMostJobs = 3;
-template <class Job>
+template <class Job, int kMost = kMostJobs>
 struct Several {
-  Job job[kMostJobs];
-  unsigned end[kMostJobs];
+  Job job[kMost];
+  unsigned end[kMost];
   int n;
 };
 

@@ -41,14 +41,19 @@ VLA_DEVICE void map(const MapJob& job, Index first, Index n) {
   }
 }
 
-}  // namespace
-
 /// A thread computes four elements.
-VLA_KERNEL(map_elements, 256, 4, MapJob) {
-  const std::int64_t n = job.count(), first = static_cast<std::int64_t>(blockIdx.x) * 1024 + thread_index();
+VLA_DEVICE void map(const MapJob& job, int block) {
+  const std::int64_t n = job.count(), first = static_cast<std::int64_t>(block) * 1024 + thread_index();
   if (n < 1U << 31) return map<4>(job, static_cast<unsigned>(first), static_cast<unsigned>(n));
 #pragma unroll 1
   for (int k = 0; k < 4; ++k) map<1>(job, first + k * 256, n);
+}
+
+}  // namespace
+
+VLA_KERNEL(map_elements, 256, 4, MapJob) { map(job, static_cast<int>(blockIdx.x)); }
+VLA_KERNEL(map_parts, 256, 4, MapJobs) {
+  run_one(job, blockIdx.x, [](const MapJob& one, int block) { map(one, block); });
 }
 
 }  // namespace vla::cuda
