@@ -177,8 +177,8 @@ MISTAKES = {
     "a split is added twice": (
         "linear_bf16.cu",
         "linear_bf16",
-        "sum.x += share[z].x, sum.y += share[z].y;",
-        "sum.x += (z == 1 ? 2 : 1) * share[z].x, sum.y += share[z].y;",
+        "sum.of[c] += share[z].of[c];",
+        "sum.of[c] += (z == 1 ? 2 : 1) * share[z].of[c];",
     ),
     "the gate is not activated": ("finish.h", "linear_bf16", "activate(has_gate ? gate : sum)", "has_gate ? gate : activate(sum)"),
     "the factor comes after the residual": (

@@ -35,6 +35,55 @@ VLA_DEVICE float activate(Activation activation, float x) {
   return is_sigmoid(activation) ? activate_by_sigmoid(activation, x) : activate_otherwise(activation, x);
 }
 
+/// Calls run(activate), with code of its own for the activations of most networks, or otherwise(activate). An
+/// instruction that a value skips still comes to the cache, past which it takes longer than the value.
+template <class Run, class Otherwise>
+VLA_DEVICE void with_activation(Activation activation, Run run, Otherwise otherwise) {
+  if (activation == Activation::none)
+    run([](float x) { return x; });
+  else if (is_sigmoid(activation))
+    run([=](float x) { return activate_by_sigmoid(activation, x); });
+  else
+    otherwise([=](float x) { return activate_otherwise(activation, x); });
+}
+
+/// Four adjacent elements of a row, of which n are there; together: they are aligned to their size, and all there.
+struct Four {
+  float of[4];
+};
+VLA_DEVICE Four load_four(const float* from, bool together, int n) {
+  Four to = {};
+  if (together) {
+    const float4 four = *reinterpret_cast<const float4*>(from);
+    to.of[0] = four.x, to.of[1] = four.y, to.of[2] = four.z, to.of[3] = four.w;
+  } else {
+#pragma unroll
+    for (int i = 0; i < 4; ++i)
+      if (i < n) to.of[i] = from[i];
+  }
+  return to;
+}
+VLA_DEVICE void store_four(unsigned* to, const unsigned (&from)[4], bool together, int n) {
+  if (together) {
+    *reinterpret_cast<uint4*>(to) = uint4{from[0], from[1], from[2], from[3]};
+  } else {
+#pragma unroll
+    for (int i = 0; i < 4; ++i)
+      if (i < n) to[i] = from[i];
+  }
+}
+VLA_DEVICE void store_four(std::uint16_t* to, const Four& from, bool together, int n) {
+  const unsigned low = dev::to_bf16(from.of[0], from.of[1]), high = dev::to_bf16(from.of[2], from.of[3]);
+  if (together) {
+    *reinterpret_cast<uint2*>(to) = uint2{low, high};
+  } else {
+    const unsigned pairs[2] = {low, high};
+#pragma unroll
+    for (int i = 0; i < 4; ++i)
+      if (i < n) to[i] = static_cast<std::uint16_t>(pairs[i / 2] >> i % 2 * 16);
+  }
+}
+
 /// What an epilogue reads for two adjacent columns of a row, so that it can be asked for before the sums are there.
 struct PairEnds {
   float2 bias = {kAddsNothing, kAddsNothing}, factor = {kScalesNothing, kScalesNothing}, gate = {0, 0};
@@ -69,6 +118,16 @@ VLA_DEVICE float finish(const Epilogue& e, bool has_gate, float sum, float bias,
   sum = dev::multiply(has_gate ? dev::multiply(activated, sum) : activated, factor);
   sum = dev::add(sum, residual);
   return e.ends_in_relu && sum < 0 ? 0 : sum;
+}
+
+/// Writes y of four adjacent columns from `column` on, of which n are there.
+VLA_DEVICE void store_y(const Epilogue& e, std::int64_t row, int column, const Four& y, bool together, int n) {
+  const std::int64_t at = row * e.y_stride + column;
+  if (e.is_bf16) return store_four(static_cast<std::uint16_t*>(e.y) + at, y, together, n);
+  const unsigned words[4] = {static_cast<unsigned>(dev::bits_of(y.of[0])), static_cast<unsigned>(dev::bits_of(y.of[1])),
+                             static_cast<unsigned>(dev::bits_of(y.of[2])),
+                             static_cast<unsigned>(dev::bits_of(y.of[3]))};
+  store_four(static_cast<unsigned*>(e.y) + at, words, together, n);
 }
 
 /// Stores y of two adjacent sums; the second may be after the last column.

@@ -41,43 +41,6 @@ class FetchRows {
   int n_left_, depth_, to_;
 };
 
-/// Four adjacent elements of a row, of which n are there; together: they are aligned to their size, and all there.
-struct Four {
-  float of[4];
-};
-VLA_DEVICE Four load_four(const float* from, bool together, int n) {
-  Four to = {};
-  if (together) {
-    const float4 four = *reinterpret_cast<const float4*>(from);
-    to.of[0] = four.x, to.of[1] = four.y, to.of[2] = four.z, to.of[3] = four.w;
-  } else {
-#pragma unroll
-    for (int i = 0; i < 4; ++i)
-      if (i < n) to.of[i] = from[i];
-  }
-  return to;
-}
-VLA_DEVICE void store_four(unsigned* to, const unsigned (&from)[4], bool together, int n) {
-  if (together) {
-    *reinterpret_cast<uint4*>(to) = uint4{from[0], from[1], from[2], from[3]};
-  } else {
-#pragma unroll
-    for (int i = 0; i < 4; ++i)
-      if (i < n) to[i] = from[i];
-  }
-}
-VLA_DEVICE void store_four(std::uint16_t* to, const Four& from, bool together, int n) {
-  const unsigned low = dev::to_bf16(from.of[0], from.of[1]), high = dev::to_bf16(from.of[2], from.of[3]);
-  if (together) {
-    *reinterpret_cast<uint2*>(to) = uint2{low, high};
-  } else {
-    const unsigned pairs[2] = {low, high};
-#pragma unroll
-    for (int i = 0; i < 4; ++i)
-      if (i < n) to[i] = static_cast<std::uint16_t>(pairs[i / 2] >> i % 2 * 16);
-  }
-}
-
 /// The end of a tile, whose sums pass through shared memory, where rows of y have kColumns words and four more against
 /// bank conflicts. A thread has the same four columns of every few rows. Gated: the first half of a row are sums of the
 /// gate's matrix, the second those of the same columns of the other.
@@ -122,14 +85,10 @@ class TileEnd {
   /// Computes y of value(of_row(row), bits of a sum, which of the four columns).
   template <class OfRow, class Value>
   VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value) const {
-    const Activation activation = e_.activation;
-    const bool has_gate = kGated || e_.gate != nullptr;
-    if (together_ && activation == Activation::none && !has_gate)
-      finish_rows<kBatch, true>(sums, of_row, value, [](float x) { return x; });
-    else if (together_ && is_sigmoid(activation))
-      finish_rows<kBatch, true>(sums, of_row, value, [=](float x) { return activate_by_sigmoid(activation, x); });
-    else
-      finish_rows<1, false>(sums, of_row, value, [=](float x) { return activate(activation, x); });
+    const auto one = [&](auto activate) { finish_rows<1, false>(sums, of_row, value, activate); };
+    if (!together_) return one([&](float x) { return activate(e_.activation, x); });
+    with_activation(
+        e_.activation, [&](auto activate) { finish_rows<kBatch, true>(sums, of_row, value, activate); }, one);
   }
 
  private:
@@ -195,20 +154,12 @@ class TileEnd {
         for (int c = 0; c < 4; ++c)
           y.of[c] = cuda::finish(e_, kGated || e_.gate != nullptr, value(of[i], words[c], c), bias.of[c], factor.of[c],
                                  gate[i].of[c], residual[i].of[c], activate);
-        store(row0_ + row, y, kTogether || together_);
+        store_y(e_, row0_ + row, column_, y, kTogether || together_, n_);
       }
     }
   }
   VLA_DEVICE uint4 sums_of(const std::byte* sums, int row, int half) const {
     return dev::read<uint4>(sums + (row * (kColumns + 4) + (half * kQuads + thread_index() % kQuads) * 4) * 4);
-  }
-  VLA_DEVICE void store(std::int64_t row, const Four& y, bool together) const {
-    const std::int64_t at = row * e_.y_stride + column_;
-    if (e_.is_bf16) return store_four(static_cast<std::uint16_t*>(e_.y) + at, y, together, n_);
-    const unsigned words[4] = {
-        static_cast<unsigned>(dev::bits_of(y.of[0])), static_cast<unsigned>(dev::bits_of(y.of[1])),
-        static_cast<unsigned>(dev::bits_of(y.of[2])), static_cast<unsigned>(dev::bits_of(y.of[3]))};
-    store_four(static_cast<unsigned*>(e_.y) + at, words, together, n_);
   }
 
   const Epilogue& e_;

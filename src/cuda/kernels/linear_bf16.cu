@@ -167,40 +167,67 @@ VLA_KERNEL(linear_bf16_few, 128, 4, LinearBf16Job) { multiply_few(job); }
 
 namespace {
 
-/// Two adjacent sums of all shares of the depth, from column `at` of a row of them on, added in order. All are asked
-/// for before any is added.
-VLA_DEVICE float2 add_shares(const LinearBf16Job& job, int row, int at, bool has_second) {
+/// Four adjacent sums of all shares of the depth, of which n are there, from column `at` of a row of them on, added in
+/// order. kTogether: all are there and aligned, and shares are kMostSplits at most, all of which are asked for at once.
+template <bool kTogether>
+VLA_DEVICE Four add_shares(const LinearBf16Job& job, int row, int at, int n) {
   const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * job.n_sum();
   const float* from = job.partial + static_cast<std::int64_t>(row) * job.n_sum() + at;
-  float2 sum = {0, 0};
-  if (job.n_split > kMostSplits || !has_second || (job.n_sum() | at) % 2 != 0) {
+  Four sum = {};
+  if constexpr (kTogether) {
+    Four share[kMostSplits];
+#pragma unroll
+    for (int z = 0; z < kMostSplits; ++z) share[z] = z < job.n_split ? load_four(from + z * apart, true, 4) : Four{};
+#pragma unroll
+    for (int z = 0; z < kMostSplits; ++z)
+#pragma unroll
+      for (int c = 0; c < 4; ++c) sum.of[c] += share[z].of[c];
+  } else {
 #pragma unroll 1
-    for (int z = 0; z < job.n_split; ++z, from += apart) {
-      sum.x += from[0];
-      if (has_second) sum.y += from[1];
+    for (int z = 0; z < job.n_split; ++z) {
+      const Four share = load_four(from + z * apart, false, n);
+#pragma unroll
+      for (int c = 0; c < 4; ++c) sum.of[c] += share.of[c];
     }
-    return sum;
   }
-  float2 share[kMostSplits];
-#pragma unroll
-  for (int z = 0; z < kMostSplits; ++z)
-    share[z] = z < job.n_split ? *reinterpret_cast<const float2*>(from + z * apart) : float2{0, 0};
-#pragma unroll
-  for (int z = 0; z < kMostSplits; ++z) sum.x += share[z].x, sum.y += share[z].y;
   return sum;
+}
+
+/// y of four adjacent columns of a row.
+template <bool kTogether>
+VLA_DEVICE void finish_four(const LinearBf16Job& job, int row, int column) {
+  const Epilogue& e = job.end;
+  const int n = job.n_column - column;
+  const auto load = [&](const float* from, std::int64_t at, float otherwise) {
+    return from ? load_four(from + at, kTogether, n) : Four{{otherwise, otherwise, otherwise, otherwise}};
+  };
+  const std::int64_t at = static_cast<std::int64_t>(row) * job.n_column + column;
+  const Four bias = load(e.bias, column, kAddsNothing), factor = load(e.factor, column, kScalesNothing);
+  const Four gate_bias = load(job.gate_bias, column, kAddsNothing), residual = load(e.residual, at, kAddsNothing);
+  const Four sum = add_shares<kTogether>(job, row, job.n_sum() - job.n_column + column, n);
+  const Four gate = job.gate_weight ? add_shares<kTogether>(job, row, column, n) : load(e.gate, at, 0);
+  Four y;
+  const auto run = [&](auto activate) {
+#pragma unroll
+    for (int c = 0; c < 4; ++c)
+      y.of[c] = finish(e, job.gate_weight || e.gate, sum.of[c], bias.of[c], factor.of[c],
+                       dev::add(gate.of[c], gate_bias.of[c]), residual.of[c], activate);
+  };
+  with_activation(e.activation, run, run);
+  store_y(e, row, column, y, kTogether, n);
 }
 
 /// Adds the partial sums of a split and computes y.
 VLA_DEVICE void finish_partial(const LinearBf16Job& job, int block) {
-  const int row = static_cast<int>(blockIdx.y), column = (block * 128 + thread_index()) * 2;
+  const int row = static_cast<int>(blockIdx.y), column = (block * 128 + thread_index()) * 4;
   if (column >= job.n_column) return;
-  PairEnds ends = load_ends(job.end, row, column, job.n_column);
-  const float2 sum = add_shares(job, row, job.n_sum() - job.n_column + column, ends.has_second);
-  if (job.gate_weight) {
-    ends.gate = add_shares(job, row, column, ends.has_second), ends.has_gate = true;
-    add_gate_bias(job, ends, column);
-  }
-  finish_pair(job.end, ends, sum.x, sum.y, row, column);
+  const Epilogue& e = job.end;
+  const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
+  const auto all = bits(e.bias) | bits(e.factor) | bits(e.gate) | bits(e.residual) | bits(e.y) | bits(job.gate_bias);
+  if ((job.n_column | e.y_stride) % 4 == 0 && (all | bits(job.partial)) % 16 == 0 && job.n_split <= kMostSplits)
+    finish_four<true>(job, row, column);
+  else
+    finish_four<false>(job, row, column);
 }
 
 }  // namespace

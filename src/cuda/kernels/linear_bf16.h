@@ -138,7 +138,7 @@ inline Launch hopper_linears_bf16(const HopperTile& tile, Several<LinearBf16Job>
 }
 
 inline Launch finish_bf16_partial(const LinearBf16Job& job) {
-  return {"linear_bf16_finish", {blocks(job.n_column, 256), static_cast<unsigned>(job.n_row)}, 128};
+  return {"linear_bf16_finish", {blocks(job.n_column, 512), static_cast<unsigned>(job.n_row)}, 128};
 }
 inline Launch finish_bf16_partials(Several<LinearBf16Job>& jobs) {
   unsigned n_block = 0;
