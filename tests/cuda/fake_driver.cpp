@@ -452,7 +452,9 @@ int counted(const std::string& symbol, Args... args) {
   if (!has_word(symbol, {"cuInit", "cuDriver", "cuDevice", "cuCtx"}) &&
       !state.users.contains(std::this_thread::get_id()))
     return kInvalidContext;
-  return kCall(args...);
+  const int result = kCall(args...);
+  if (result != 0) state.driver.refused.push_back(symbol);
+  return result;
 }
 
 }  // namespace

@@ -37,9 +37,10 @@ struct FakeDriver {
   std::map<std::string, long> n_call;  // by symbol
   long n_calls = 0;
   bool logs = false;
-  std::vector<std::string> log;  // of symbols, where it logs
-  std::string failed_call;       // the first that was told to fail
-  std::string fault;             // why a kernel failed
+  std::vector<std::string> log;      // of symbols, where it logs
+  std::string failed_call;           // the first that was told to fail
+  std::vector<std::string> refused;  // symbols of calls that were answered with an error that nobody told it
+  std::string fault;                 // why a kernel failed
   std::size_t used = 0;
   long n_handle = 0;  // contexts, streams, events, modules, graphs and host memory that were not given back
 };

@@ -113,6 +113,8 @@ TEST_CASE("a captured graph of forked streams runs as often as it is launched, i
     const std::vector<float> expected = program.expected();
     for (std::size_t k = 0; k < y.size(); ++k) CHECK(y[k] == doctest::Approx(expected[k]).epsilon(1e-5));
     CHECK(nothing_held());
+    CHECK(fake_driver().refused.empty());
+    CHECK(fake_driver().n_call["cuModuleGetFunction"] == 2);
     CHECK(fake_driver().n_call["cuMemAlloc_v2"] == 1);
     CHECK(fake_driver().n_call["cuLaunchKernelEx"] == 3);
     CHECK(fake_driver().n_call["cuGraphLaunch"] == 3);

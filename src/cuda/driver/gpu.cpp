@@ -12,9 +12,9 @@ namespace vla::cuda {
 namespace {
 
 // Values of CUDA Driver API 13.0.
-constexpr int kOutOfMemory = 2, kNotFound = 500;
+constexpr int kOutOfMemory = 2;
 constexpr int kCapabilityMajor = 75, kCapabilityMinor = 76, kCountSm = 16, kMaxDynamicShared = 8;
-constexpr unsigned kNonBlocking = 1, kNoTiming = 2, kFreeShared = 48 << 10;
+constexpr unsigned kNonBlocking = 1, kNoTiming = 2;
 constexpr int kThreadLocal = 1;
 constexpr int kOverlaps = 6;                     // attribute of a launch: programmatic stream serialization
 constexpr int kErrorLog = 5, kErrorLogSize = 6;  // options of module_load
@@ -32,6 +32,17 @@ bool is_for(const std::string& module, int capability) {
   const long target = std::strtol(text, &end, 10);
   if (*end == 'a') return capability == target;
   return target == (capability < 90 ? 80 : 90);
+}
+
+/// The names of a module's kernels.
+std::vector<std::string> kernels_of(const std::string& ptx) {
+  constexpr std::string_view kEntry = ".entry ";
+  std::vector<std::string> names;
+  for (std::size_t at = ptx.find(kEntry); at != std::string::npos; at = ptx.find(kEntry, at)) {
+    at += kEntry.size();
+    names.push_back(ptx.substr(at, ptx.find('(', at) - at));
+  }
+  return names;
 }
 
 }  // namespace
@@ -115,6 +126,9 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
   for (const std::string& text : modules) {
     if (!is_for(text, capability_)) continue;
     VLA_TRY(Owned loaded, load(text));
+    const std::vector<std::string> kernels = kernels_of(text);
+    for (const std::string& kernel : kernels) functions_[kernel].module = loaded.get();
+    if (kernels.empty()) unlisted_ = loaded.get();
     modules_.push_back(std::move(loaded));
   }
   return {};
@@ -205,20 +219,10 @@ Status Gpu::prepare(const Launch& how) {
 
 /// The function of a kernel, which is allowed the shared memory that the launch asks for.
 Result<Handle> Gpu::kernel(const Launch& how) {
-  const auto [found, is_new] = functions_.try_emplace(how.kernel, Function{nullptr, kFreeShared});
-  Function& function = found->second;
-  for (std::size_t i = 0; i < modules_.size() && function.handle == nullptr; ++i) {
-    const int result = driver_.module_function(&function.handle, modules_[i].get(), how.kernel);
-    if (result == kNotFound) function.handle = nullptr;
-    if (result != 0 && result != kNotFound) {
-      functions_.erase(found);
-      VLA_CHECK(check("module_function", result));
-    }
-  }
-  if (function.handle == nullptr) {
-    functions_.erase(found);
-    return Error{Code::internal, how.kernel, "a kernel of a loaded module", "none"};
-  }
+  Function& function = functions_[how.kernel];
+  if (function.module == nullptr) function.module = unlisted_;
+  if (function.module == nullptr) return Error{Code::internal, how.kernel, "a kernel of a loaded module", "none"};
+  if (function.handle == nullptr) VLA_CHECK(CALL(module_function, &function.handle, function.module, how.kernel));
   if (how.shared > function.shared) {
     VLA_CHECK(CALL(function_attribute, function.handle, kMaxDynamicShared, static_cast<int>(how.shared)));
     function.shared = how.shared;

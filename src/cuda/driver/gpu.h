@@ -155,9 +155,10 @@ class Gpu {
   std::string name_;
   Handle context_ = nullptr;
   std::vector<Owned> modules_;
+  Handle unlisted_ = nullptr;  // the module of kernels that no text lists, as a test's driver has
   struct Function {
-    Handle handle;
-    unsigned shared;  // bytes of shared memory that it may use
+    Handle module = nullptr, handle = nullptr;
+    unsigned shared = 48 << 10;  // bytes of shared memory that it may use
   };
   std::map<std::string, Function> functions_;
 };
