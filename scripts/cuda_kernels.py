@@ -4,6 +4,7 @@
 """Our CUDA kernels as PTX and as machine code of seven architectures, without a GPU.
 
     scripts/cuda_kernels.py ptx OUT                  OUT/*.ptx, as tests/cuda runs them
+    scripts/cuda_kernels.py embed OUT [--module M]   what the library has inside: OUT/*.ptx and, for Hopper, OUT/*.sm_90.cubin
     scripts/cuda_kernels.py cubins OUT [--sm 87]     registers, spills and shared memory of every kernel, and its main loop
 
 A main loop is the innermost loop with tensor instructions, from its label to the branch back. Shares of the tensor units'
@@ -88,10 +89,19 @@ def compile_ptx(source, out, target, sources=SOURCES, warnings=("-Werror", "all-
     return target_file
 
 
-def compile_all(out):
+def compile_module(source, out, target, embeds=False):
+    """PTX, and where it `embeds` Hopper's machine code beside it. Orin would gain nothing: JetPack 6 has a driver for CUDA 12."""
+    ptx = compile_ptx(source, out, target)
+    if embeds and target != "80":
+        assemble(ptx, 90, out)
+    return ptx
+
+
+def compile_all(out, module=None, embeds=False):
+    jobs = [(source, out, target, embeds) for source in kernel_files() for target in targets(source)]
+    jobs = [job for job in jobs if module in (None, f"{job[0].stem}_sm{job[2]}")]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        jobs = [(source, out, target) for source in kernel_files() for target in targets(source)]
-        return list(pool.map(lambda job: compile_ptx(*job), jobs))
+        return list(pool.map(lambda job: compile_module(*job), jobs))
 
 
 def assemble(ptx, sm, out):
@@ -168,15 +178,16 @@ def report(ptx_files, sm, out):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["ptx", "cubins"])
+    parser.add_argument("what", choices=["ptx", "embed", "cubins"])
     parser.add_argument("out", type=Path)
     parser.add_argument("--sm", type=int, action="append", help="an architecture; default: all seven")
+    parser.add_argument("--module", help="one alone, such as rows_sm90; default: all")
     options = parser.parse_args()
     if not tool("nvcc"):
         sys.exit("no nvcc: scripts/cuda.sh .cache/nvcc nvcc downloads it, or VLA_NVCC_DIR names its folder")
     options.out.mkdir(parents=True, exist_ok=True)
-    files = compile_all(options.out)
-    if options.what == "ptx":
+    files = compile_all(options.out, options.module, options.what == "embed")
+    if options.what != "cubins":
         return
     print("sm   kernel                registers  spills  shared  main loop: instructions, tensor, LDSM")
     for sm in options.sm or ARCHITECTURES:

@@ -39,8 +39,9 @@ def run(*command):
 
 def copy_programs(build, kit):
     """Programs without symbols, libraries that they are linked to, and what runs them and PyTorch from Python."""
-    for folder in ("bin", "lib", "runtime", "ptx"):
-        (kit / folder).mkdir()
+    for folder in ("bin/ptx", "lib", "runtime"):
+        (kit / folder).mkdir(parents=True)
+    images = sorted((build / "src/cuda/ptx").iterdir())  # PTX and machine code
     programs = [build / "bin" / name for name in ("vla", "bench_products", "bench_attention_gpu", "test_kernels_gpu")]
     files = [*programs, build / "lib/libvla.so.1", build / "lib/libvla-cuda.so"]
     for file in files:
@@ -48,9 +49,9 @@ def copy_programs(build, kit):
             sys.exit(f"error: {file}: expected what make cuda builds, found nothing")
         if file.name not in ("vla", "libvla.so.1"):
             inside = file.read_bytes()
-            for ptx in (build / "src/cuda/ptx").glob("*.ptx"):
-                if ptx.read_bytes() not in inside:
-                    sys.exit(f"error: {file}: expected {ptx.name} of this build inside, found none or another; make cuda again")
+            for image in images:
+                if image.read_bytes() not in inside:
+                    sys.exit(f"error: {file}: expected {image.name} of this build inside, found none or another; make cuda again")
         shutil.copy(file, kit / "bin" / file.name)
         run("strip", "--strip-unneeded", kit / "bin" / file.name)
     for file in files:
@@ -58,8 +59,8 @@ def copy_programs(build, kit):
             name = Path(library).name
             if not OF_THE_SYSTEM.match(name):
                 shutil.copy(library, kit / ("runtime" if name in RUNTIME else "lib") / name)
-    for ptx in (build / "src/cuda/ptx").glob("*.ptx"):
-        shutil.copy(ptx, kit / "ptx")
+    for image in images:
+        shutil.copy(image, kit / "bin/ptx")  # among programs that have the same bytes, which xz then finds
     for folder in ("python/vla_cpp", "tools/goldens", "tests/golden/tokenizers/smolvla"):
         shutil.copytree(ROOT / folder, kit / folder, ignore=shutil.ignore_patterns("__pycache__", "eval", "export"))
     (kit / "tools/peers").mkdir()
@@ -143,7 +144,7 @@ def main():
         copy_scripts(kit)
         options.out.mkdir(parents=True, exist_ok=True)
         archive = options.out / f"{NAME}.tar.xz"
-        with tarfile.open(archive, "w:xz", preset=9) as tar:  # whose window is larger than a program, as all have the same PTX
+        with tarfile.open(archive, "w:xz", preset=9) as tar:  # whose window is larger than two programs, as all have the same kernels
             tar.add(kit, arcname=NAME, filter=owned_by_nobody)
     size = archive.stat().st_size
     print(f"{archive}: {size / (1 << 20):.1f} MiB")

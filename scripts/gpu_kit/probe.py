@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """NVIDIA's driver by itself, call by call as src/cuda/driver makes them, with what its compiler says: for when nothing else runs.
 
-    python3 probe.py [PTX ...]"""
+    python3 probe.py [FILE ...]     # files of PTX or machine code"""
 
 import argparse
 import ctypes
@@ -43,13 +43,13 @@ class Probe:
         self("cuDevicePrimaryCtxRetain", byref(context), device)
         self("cuCtxSetCurrent", context)
 
-    def compile(self, file):
+    def load(self, file):
         log = ctypes.create_string_buffer(1 << 16)
         options = (c_int * 2)(ERROR_LOG, ERROR_LOG_SIZE)
         values = (c_void_p * 2)(ctypes.cast(log, c_void_p), c_void_p(len(log)))
         module = c_void_p()
-        with open(file, "rb") as text:
-            code = self("cuModuleLoadDataEx", byref(module), text.read() + b"\0", 2, options, values)
+        with open(file, "rb") as image:
+            code = self("cuModuleLoadDataEx", byref(module), image.read() + b"\0", 2, options, values)
         print(f"  {file}{': ' + log.value.decode(errors='replace') if code else ''}")
 
     def capture(self):
@@ -69,10 +69,10 @@ class Probe:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ptx", nargs="*")
-    files = parser.parse_args().ptx
+    parser.add_argument("files", nargs="*")
+    files = parser.parse_args().files
     probe = Probe()
     probe.open()
-    for ptx in files:
-        probe.compile(ptx)
+    for file in files:
+        probe.load(file)
     probe.capture()

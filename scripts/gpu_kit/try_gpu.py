@@ -288,7 +288,7 @@ def diagnose(visit):
     """Each call of the driver by itself, and an act in other ways of loading and launching."""
     asked = json.loads((KIT / "tiny/act.json").read_text())
     command = [VLA, "run", TINY, *asked["arguments"], "--device", "cuda", "--kernels", "bf16"]
-    code, out, err, _ = visit.run([sys.executable, KIT / "probe.py", *sorted((KIT / "ptx").glob("*.ptx"))], 180)
+    code, out, err, _ = visit.run([sys.executable, KIT / "probe.py", *sorted((KIT / "bin/ptx").iterdir())], 180)
     print(out + err)
     visit.result["probe"] = (out + err).splitlines()
     for name, value in (("CUDA_MODULE_LOADING", "EAGER"), ("CUDA_LAUNCH_BLOCKING", "1"), ("CUDA_CACHE_DISABLE", "1")):

@@ -315,8 +315,11 @@ struct Calls {
     if (captures()) return kCaptureUnsupported;
     auto module = std::make_unique<Module>();
     const std::string text = static_cast<const char*>(image);
+    const bool is_machine_code = text.starts_with('\x7f');
+    state.driver.images.push_back(text.substr(0, 32));
+    if (is_machine_code && !state.driver.takes_machine_code) return kInvalidImage;
     try {
-      if (text != kHostModule) module->ptx = parsed(text);
+      if (text != kHostModule && !is_machine_code) module->ptx = parsed(text);
     } catch (const Fault& fault) {
       state.driver.fault = fault.what();
       write_log(fault.what(), n_option, options, values);

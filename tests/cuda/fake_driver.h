@@ -18,8 +18,9 @@ namespace vla::test::cuda {
 /// A module of the kernels that the host's compiler made.
 constexpr const char* kHostModule = "host";
 
-constexpr int kInvalidValue = 1, kOutOfMemory = 2, kInvalidContext = 201, kInvalidPtx = 218, kInvalidHandle = 400,
-              kNotFound = 500, kLaunchFailed = 719, kCaptureUnsupported = 900, kCaptureUnjoined = 904;
+constexpr int kInvalidValue = 1, kOutOfMemory = 2, kInvalidImage = 200, kInvalidContext = 201, kInvalidPtx = 218,
+              kInvalidHandle = 400, kNotFound = 500, kLaunchFailed = 719, kCaptureUnsupported = 900,
+              kCaptureUnjoined = 904;
 
 /// How the driver behaves, and what was asked of it.
 struct FakeDriver {
@@ -32,6 +33,8 @@ struct FakeDriver {
   bool is_lost_then = false;
   /// Else kernels leave what was there, and memory is zeros at first: for tests of calls alone.
   bool computes = true;
+  /// Whether it takes machine code, which it reads as kHostModule.
+  bool takes_machine_code = false;
   std::FILE* counts = nullptr;  // gets a line for each call
 
   std::map<std::string, long> n_call;  // by symbol
@@ -40,6 +43,7 @@ struct FakeDriver {
   std::vector<std::string> log;      // of symbols, where it logs
   std::string failed_call;           // the first that was told to fail
   std::vector<std::string> refused;  // symbols of calls that were answered with an error that nobody told it
+  std::vector<std::string> images;   // what it was asked to load, its first 32 bytes
   std::string fault;                 // why a kernel failed
   std::size_t used = 0;
   long n_handle = 0;  // contexts, streams, events, modules, graphs and host memory that were not given back

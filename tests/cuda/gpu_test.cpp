@@ -174,6 +174,41 @@ TEST_CASE("what a device lacks is refused with what was expected and found") {
         std::string::npos);
 }
 
+TEST_CASE("machine code is loaded by a driver that takes it on the architecture that it is of, else its PTX") {
+  const auto ptx = [](const std::string& target, const std::string& kernel) {
+    return ".target sm_" + target + "\n.address_size 64\n.visible .entry " + kernel +
+           "(\n.param .align 8 .b8 p[8]\n)\n{\nret;\n}\n";
+  };
+  const std::string code = "\177ELF of ", forward = ".target sm_90\n", alone = ".target sm_90a";
+  const std::vector<std::string> modules = {ptx("80", "map_elements"), ptx("90", "map_elements"), code + "90",
+                                            ptx("90a", "norm_rows"), code + "90a"};
+  using Images = std::vector<std::string>;
+  struct Case {
+    int version, capability;
+    bool takes_machine_code;
+    Images images;  // what is asked for, as it begins
+  };
+  for (const Case& one :
+       {Case{13000, 90, true, {code + "90", code + "90a"}},
+        Case{13000, 90, false, {code + "90", forward, code + "90a", alone}}, Case{12080, 90, true, {forward, alone}},
+        Case{13000, 120, true, {forward}}, Case{13000, 87, true, {".target sm_80\n"}}}) {
+    INFO(one.version, " ", one.capability, " ", one.takes_machine_code);
+    reset_fake_driver();
+    fake_driver().version = one.version, fake_driver().takes_machine_code = one.takes_machine_code;
+    fake_driver().major = one.capability / 10, fake_driver().minor = one.capability % 10;
+    const auto gpu = Gpu::open(fake_driver_table(), 0, modules);
+    REQUIRE(gpu);
+    const Images& asked = fake_driver().images;
+    REQUIRE(asked.size() == one.images.size());
+    for (std::size_t i = 0; i < asked.size(); ++i) CHECK(asked[i].starts_with(one.images[i]));
+    CHECK((*gpu)->prepare({"map_elements", {}, 32}));
+    const Status hopper = (*gpu)->prepare({"norm_rows", {}, 32});
+    CHECK(hopper.ok() == (one.capability == 90));
+    if (!hopper) CHECK(hopper.error().message() == "norm_rows: expected a kernel of a loaded module, found none");
+    CHECK(fake_driver().refused.size() == (one.takes_machine_code ? 0 : 2));
+  }
+}
+
 TEST_CASE("capturing refuses what no graph can hold, and a stream that is not waited for") {
   reset_fake_driver();
   auto gpu = Gpu::open(fake_driver_table(), 0, modules_of_tests());

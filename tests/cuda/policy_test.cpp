@@ -123,6 +123,7 @@ TEST_CASE_FIXTURE(Driver,
       REQUIRE_MESSAGE(chunk.ok(), (chunk ? "" : chunk.error().message()));
       if (i > 0) CHECK(calls_since(before) == kAct);
     }
+    CHECK(fake_driver().refused.empty());
   }
 }
 

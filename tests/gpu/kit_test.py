@@ -25,7 +25,7 @@ PROGRAMS = Path(os.environ.get("VLA_BINARY", "")).parent
 def kit(tmp_path_factory):
     """The kit with programs that have the kernels of tests in the place of PTX."""
     kit = tmp_path_factory.mktemp("kit") / pack.NAME
-    for folder in ("bin", "lib", "ptx"):
+    for folder in ("bin/ptx", "lib"):
         (kit / folder).mkdir(parents=True)
     for file in (BINARY, BINARY.parent / "libvla.so.1", BINARY.parent / "libvla-cuda.so", PROGRAMS / "bench_products", PROGRAMS / "bench_attention_gpu", PROGRAMS / "test_kernels_gpu"):
         shutil.copy(file, kit / "bin")

@@ -12,7 +12,7 @@ namespace vla::cuda {
 namespace {
 
 // Values of CUDA Driver API 13.0.
-constexpr int kOutOfMemory = 2;
+constexpr int kOutOfMemory = 2, kInvalidImage = 200, kNoBinary = 209;
 constexpr int kCapabilityMajor = 75, kCapabilityMinor = 76, kCountSm = 16, kMaxDynamicShared = 8;
 constexpr unsigned kNonBlocking = 1, kNoTiming = 2;
 constexpr int kThreadLocal = 1;
@@ -23,16 +23,21 @@ std::string version_text(int version) {
   return std::to_string(version / 1000) + "." + std::to_string(version % 1000 / 10);
 }
 
-/// Whether a module is for a device of this capability. One that names no architecture is for all.
-bool is_for(const std::string& module, int capability) {
-  const std::size_t at = module.find(".target sm_");
-  if (at == std::string::npos) return true;
-  const char* text = module.c_str() + at + 11;
-  char* end = nullptr;
-  const long target = std::strtol(text, &end, 10);
-  if (*end == 'a') return capability == target;
-  return target == (capability < 90 ? 80 : 90);
+/// The architecture that PTX names, with "a" behind one that no other device runs; empty where it names none.
+std::string target_of(const std::string& ptx) {
+  constexpr std::string_view kTarget = ".target sm_";
+  const std::size_t at = ptx.find(kTarget);
+  if (at == std::string::npos) return "";
+  const std::size_t first = at + kTarget.size();
+  return ptx.substr(first, ptx.find_first_not_of("0123456789a", first) - first);
 }
+
+/// Whether PTX is for a device of this capability. PTX that names no architecture is for all.
+bool is_for(const std::string& target, int capability) {
+  return target.empty() || target == (capability < 90 ? "80" : "90") || target == std::to_string(capability) + "a";
+}
+
+bool is_machine_code(const std::string& image) { return image.starts_with("\177ELF"); }
 
 /// The names of a module's kernels.
 std::vector<std::string> kernels_of(const std::string& ptx) {
@@ -123,10 +128,15 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
   name_ = name;
   VLA_CHECK(CALL(context_retain, &context_, device_));
   VLA_CHECK(use());
-  for (const std::string& text : modules) {
-    if (!is_for(text, capability_)) continue;
-    VLA_TRY(Owned loaded, load(text));
-    const std::vector<std::string> kernels = kernels_of(text);
+  int version = 0;
+  VLA_CHECK(CALL(driver_version, &version));
+  for (std::size_t i = 0; i < modules.size(); ++i) {
+    const std::string target = target_of(modules[i]);
+    if (is_machine_code(modules[i]) || !is_for(target, capability_)) continue;
+    const bool has_code = i + 1 < modules.size() && is_machine_code(modules[i + 1]) && version >= kCodeDriver &&
+                          target.starts_with(std::to_string(capability_));
+    VLA_TRY(Owned loaded, load(modules[i], has_code ? &modules[i + 1] : nullptr));
+    const std::vector<std::string> kernels = kernels_of(modules[i]);
     for (const std::string& kernel : kernels) functions_[kernel].module = loaded.get();
     if (kernels.empty()) unlisted_ = loaded.get();
     modules_.push_back(std::move(loaded));
@@ -134,13 +144,17 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
   return {};
 }
 
-/// Where the driver's compiler refuses the module, the error has what that says.
-Result<Owned> Gpu::load(const std::string& module) const {
+/// A module, of its machine code unless there is none or the driver refuses that. Where the driver's compiler refuses
+/// PTX, the error has what it says.
+Result<Owned> Gpu::load(const std::string& ptx, const std::string* machine_code) const {
   std::array<char, 4096> log = {};
   int options[] = {kErrorLog, kErrorLogSize};
   void* values[] = {log.data(), reinterpret_cast<void*>(log.size() - 1)};
   Handle loaded = nullptr;
-  const int result = driver_.module_load(&loaded, module.c_str(), 2, options, values);
+  int result = kNoBinary;
+  if (machine_code != nullptr) result = driver_.module_load(&loaded, machine_code->data(), 2, options, values);
+  if (result == kNoBinary || result == kInvalidImage)
+    result = driver_.module_load(&loaded, ptx.c_str(), 2, options, values);
   Result<Owned> owned = own("module_load", result, loaded, driver_.module_unload);
   if (owned || log[0] == '\0') return owned;
   std::string said = log.data();

@@ -108,9 +108,13 @@ class Gpu {
  public:
   /// Driver version and compute capability that our kernels need.
   static constexpr int kMinDriver = 12060, kMinCapability = 80;
+  /// The first driver that takes machine code of CUDA 13's compiler.
+  static constexpr int kCodeDriver = 13000;
 
   /// Opens the device's context and loads those of the modules, PTX texts, that are of its architecture: of texts for
-  /// sm_80 and for sm_90 the latter from Hopper on; one for sm_90a on Hopper alone.
+  /// sm_80 and for sm_90 the latter from Hopper on; one for sm_90a on Hopper alone. Behind a text may stand machine
+  /// code (an ELF file) of it for exactly that architecture, which is loaded instead where the driver takes it: nothing
+  /// is compiled then.
   static Result<std::unique_ptr<Gpu>> open(const Driver& driver, int device, const std::vector<std::string>& modules);
   Gpu(const Gpu&) = delete;
   ~Gpu();
@@ -144,7 +148,7 @@ class Gpu {
   friend class Stream;
   explicit Gpu(const Driver& driver) : driver_(driver) {}
   Status start(int device, const std::vector<std::string>& modules);
-  Result<Owned> load(const std::string& module) const;
+  Result<Owned> load(const std::string& ptx, const std::string* machine_code) const;
   Result<Handle> kernel(const Launch& how);
   Status check(const char* call, int result) const;
   /// Checks a call that creates a handle.

@@ -7,7 +7,8 @@
 
 namespace vla::cuda {
 
-/// All kernels as texts for a driver: PTX inside the library, or the names that a test's driver knows.
+/// All kernels as Gpu::open takes them: PTX inside the library, and behind some their machine code; or the names that a
+/// test's driver knows.
 std::vector<std::string> kernel_modules();
 
 }  // namespace vla::cuda
