@@ -3,7 +3,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Packs what tries vla.cpp on a GPU elsewhere into one archive: programs, their libraries, tests of kernels, golden cases and a small policy.
 
-    .venv/bin/python scripts/gpu_kit/pack.py [--build build/cpu] [--out out] [--small]     # make gpu-kit
+    .venv/bin/python scripts/gpu_kit/pack.py [--build build/cpu] [--out out] [--small | --smallest]     # make gpu-kit
 
 There, on a machine with NVIDIA's driver and Python: python3 -m tarfile -e vla-gpu-kit.tar.xz && python3 vla-gpu-kit/try_gpu.py RESULT"""
 
@@ -81,13 +81,16 @@ def copy_tiny(vla, kit):
     (kit / "tiny/act.json").write_text(json.dumps({"arguments": asked("tiny/frame.png"), "answers": answers}))
 
 
-def chosen_cases(is_small):
-    """All golden cases, but of those with a large bundle (ACT's, whose vision tower has one size) the smallest of an architecture, or none."""
+def chosen_cases(is_small, is_smallest=False):
+    """All golden cases, but of those with a large bundle (ACT's, whose vision tower has one size) the smallest of an architecture, or none.
+    The smallest kit has the smallest case alone of any architecture, and none with a large bundle."""
     from golden_cases import NAMES, Golden
 
     by_size = sorted(NAMES, key=lambda name: Golden(name).bundle.stat().st_size)
     is_large = {name: Golden(name).bundle.stat().st_size > LARGE for name in NAMES}
     first = {name.split("/")[0]: name for name in reversed(by_size)}
+    if is_smallest:
+        return [name for name in NAMES if not is_large[name] and name in first.values()]
     return [name for name in NAMES if not is_large[name] or (not is_small and name in first.values())]
 
 
@@ -133,14 +136,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--build", type=Path, default=ROOT / "build/cpu")
     parser.add_argument("--out", type=Path, default=ROOT / "out")
-    parser.add_argument("--small", action="store_true", help="without ACT's golden case, 20 MiB less")
+    parser.add_argument("--small", action="store_true", help="without ACT's golden case, 12 MiB less")
+    parser.add_argument("--smallest", action="store_true", help="with one golden case of each other architecture, 28 MiB less")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         kit = Path(folder) / NAME
         kit.mkdir()
         copy_programs(options.build, kit)
         copy_tiny(options.build / "bin/vla", kit)
-        copy_cases(kit, chosen_cases(options.small))
+        copy_cases(kit, chosen_cases(options.small, options.smallest))
         copy_scripts(kit)
         options.out.mkdir(parents=True, exist_ok=True)
         archive = options.out / f"{NAME}.tar.xz"
