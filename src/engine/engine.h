@@ -15,6 +15,10 @@
 
 namespace vla {
 
+namespace kernels {
+class Executor;
+}
+
 struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
   std::string kernels;      // as open_device takes them; empty: the machine's best for the bundle's dtype
@@ -151,6 +155,7 @@ class Engine {
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads
   std::unique_ptr<Device> device_;   // goes after what it made
+  std::shared_ptr<kernels::Executor> image_threads_;
   std::vector<std::unique_ptr<Robot>> robots_;
   std::optional<Plans> plans_;
   std::optional<std::pair<const Robot*, InputShape>> last_;

@@ -126,10 +126,10 @@ ChunkShape Robot::chunk_shape() const {
 }
 
 Status Robot::encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
-                     EncodedObservation& to) const {
+                     EncodedObservation& to, const RunItems& run) const {
   StageClock clock;
   to.timing.clear(), to.steering.reset();
-  VLA_CHECK(processor_.encode_images(observation, to.inputs));
+  VLA_CHECK(processor_.encode_images(observation, to.inputs, run));
   VLA_CHECK(processor_.encode_state(observation, to.inputs));
   clock.lap(to.timing, "preprocess");
   VLA_CHECK(processor_.encode_text(observation, to.inputs));

@@ -67,9 +67,10 @@ class Robot {
   /// Changes the number of solver steps. The robot must have no plans. Errors: bad_bundle, out_of_memory, device.
   Status set_steps(int n_step, Device& device, bool dry);
 
-  /// Fills everything in `to` except its robot. Errors: bad_observation, unsupported.
+  /// Fills everything in `to` except its robot; `run` prepares parts of the images. Errors: bad_observation,
+  /// unsupported, out_of_memory.
   Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
-                EncodedObservation& to) const;
+                EncodedObservation& to, const RunItems& run = one_by_one) const;
   /// The same of zeros, of this size. Errors: bad_observation where no observation has it.
   Result<EncodedObservation> zeros(const InputShape& shape) const;
   /// Turns the network's answer, (solver_horizon, d_action_padded) or tokens, into the robot's rows and columns, with

@@ -14,7 +14,9 @@ constexpr std::size_t kChannels = 3;
 /// Applies the ops after the fit, which change each element of a plane separately.
 void apply_ops(const Recipe& recipe, int view, std::span<float> planes) {
   for (const auto& op : recipe.image)
-    if (op->view() == PlaneOp::kEveryView || op->view() == view) op->apply(planes);
+    if (op->view() == PlaneOp::kEveryView || op->view() == view)
+      for (std::size_t c = 0; c < kChannels; ++c)
+        op->apply(planes.subspan(c * planes.size() / kChannels, planes.size() / kChannels), c);
 }
 
 /// What the ops make of black, then of white, per channel.

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <map>
 #include <memory>
 #include <optional>
@@ -47,6 +48,12 @@ struct Inputs {
 /// note: ten standard deviations, or five times the range of the training data. Degrees in place of radians exceed it.
 inline constexpr double kStateBound = 10.0;
 
+/// Calls `item` with each number below `n`, in any order and on any threads.
+using RunItems = std::function<void(std::size_t n, const std::function<void(std::size_t)>& item)>;
+inline void one_by_one(std::size_t n, const std::function<void(std::size_t)>& item) {
+  for (std::size_t i = 0; i < n; ++i) item(i);
+}
+
 /// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.
 class Processor {
  public:
@@ -62,7 +69,7 @@ class Processor {
 
   /// Each fills its own fields of `inputs`, and is timed on its own. A prompt may contain the state, so `encode_text`
   /// comes after `encode_state`.
-  Status encode_images(const Observation& observation, Inputs& inputs) const;
+  Status encode_images(const Observation& observation, Inputs& inputs, const RunItems& run = one_by_one) const;
   Status encode_text(const Observation& observation, Inputs& inputs) const;
   Status encode_state(const Observation& observation, Inputs& inputs) const;
 
@@ -125,7 +132,8 @@ class Processor {
   };
   Result<std::vector<PresentView>> present_views(const Observation& observation) const;
   Result<std::string> fill_prompt(const std::string& instruction, std::span<const int> state) const;
-  Status encode_view(const Frame& frame, const std::string& name, int view, std::span<float> out) const;
+  Status encode_rows(const Frame& frame, const std::string& name, int view, Rows rows,
+                     std::span<float> out) const noexcept;
   Status check_view_places(std::span<const std::int32_t> tokens) const;
   void cut_tokens(std::vector<std::int32_t>& tokens, std::size_t limit) const;
   Status read_degraded(const Keys& keys);

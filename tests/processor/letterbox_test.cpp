@@ -48,6 +48,24 @@ TEST_CASE("letterbox and affine equal torch and Pillow bit for bit at every size
   CHECK(rest.empty());
 }
 
+TEST_CASE("rows that are made alone, in any order, are those of the whole image, and no others are touched") {
+  for (const auto align : {Letterbox::Align::bottom_right, Letterbox::Align::center})
+    for (const auto& [width, height] : {std::pair{9, 4}, {4, 9}, {23, 16}, {40, 31}, {16, 12}}) {
+      const Letterbox box{16, 12, {0.25f, 0.5f, 0.75f}, align};
+      const Frame frame = frame_of(width, height);
+      const std::vector<float> whole = boxed(frame, box);
+      std::vector<float> made(whole.size(), 9.0f);
+      for (const Rows rows : {Rows{7, 12}, {0, 1}, {1, 7}}) {
+        const std::vector<float> before = made;
+        REQUIRE(letterbox_rows(frame, box, rows, made, "f").ok());
+        for (std::size_t i = 0; i < made.size(); ++i) {
+          const int row = static_cast<int>(i) / box.width % box.height;
+          CHECK(made[i] == (row >= rows.first && row < rows.end ? whole : before)[i]);
+        }
+      }
+    }
+}
+
 TEST_CASE("letterbox puts the image at the bottom right and fills the rest") {
   const Frame white{1, 2, std::vector<std::uint8_t>(6, 255)};
   const std::vector<float> wide = boxed(white, 4, 4, 0.25f);  // 2 x 4 of the 4 x 4

@@ -43,7 +43,7 @@ TEST_CASE("the recipe of the document is read op by op") {
   REQUIRE(recipe->fit->apply(Frame{1, 2, std::vector<float>(6)}, 0, planes, "top").ok());
   CHECK(planes[0] == 0.5f);  // what a tall frame leaves at the left
   REQUIRE(recipe->image.size() == 1);
-  recipe->image[0]->apply(planes);
+  recipe->image[0]->apply(planes, 0);
   CHECK(planes[0] == 0.0f);  // 2 x - 1
   REQUIRE(recipe->text.size() == 1);
   CHECK(*recipe->text[0]->apply("open", {}) == "open\n");
@@ -214,7 +214,7 @@ TEST_CASE("ops of robots and of prompts with a state are read") {
   const auto recipe = parse_recipe(robot().dump());
   REQUIRE_MESSAGE(recipe.ok(), recipe.error().message());
   std::vector<float> planes = {2.0f, -1.0f};
-  recipe->image.at(0)->apply(planes);
+  recipe->image.at(0)->apply(planes, 0);
   CHECK(planes == std::vector<float>{1.0f, 0.0f});
   CHECK(*recipe->text.at(0)->apply(" a b ", {}) == "a b");
   CHECK(*recipe->text.at(1)->apply("a_b", {}) == "a b");

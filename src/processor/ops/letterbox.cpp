@@ -21,11 +21,12 @@ struct Tap {
   float low_weight, high_weight;
 };
 
-std::vector<Tap> make_taps(int n_in, int n_out) {
+/// Those of the positions in `of`.
+std::vector<Tap> make_taps(int n_in, int n_out, Rows of) {
   const float scale = static_cast<float>(n_in) / static_cast<float>(n_out);
   std::vector<Tap> taps;
-  taps.reserve(static_cast<std::size_t>(n_out));
-  for (int i = 0; i < n_out; ++i) {
+  taps.reserve(static_cast<std::size_t>(of.end - of.first));
+  for (int i = of.first; i < of.end; ++i) {
     // torch fuses this product and difference. Both are exact in double, so there is one rounding here too.
     const double exact = static_cast<double>(scale) * (static_cast<double>(i) + 0.5) - 0.5;
     const float source = std::max(static_cast<float>(exact), 0.0f);
@@ -55,8 +56,8 @@ struct Target {
 };
 
 template <class Source>
-inline __attribute__((always_inline)) void copy(Source source, const Target& to) {
-  for (int y = 0; y < to.height; ++y)
+void copy(Source source, const Target& to, Rows rows) {
+  for (int y = rows.first; y < rows.end; ++y)
     for (int x = 0; x < to.width; ++x)
       for (std::size_t c = 0; c < 3; ++c) {
         const auto row = static_cast<std::size_t>(y), column = static_cast<std::size_t>(x);
@@ -65,49 +66,89 @@ inline __attribute__((always_inline)) void copy(Source source, const Target& to)
       }
 }
 
+/// What the columns of the output read in a row of the source: (3, width) at their left and at their right position.
+struct SourceRow {
+  int row = -1;
+  std::vector<float> left, right;
+};
+
 template <class Source>
-inline __attribute__((always_inline)) void resample(Source source, int source_width, const std::vector<Tap>& rows,
-                                                    const std::vector<Tap>& columns, const Target& to) {
-  const auto row_size = static_cast<std::size_t>(source_width) * 3;
-  for (std::size_t y = 0; y < rows.size(); ++y) {
-    const Tap& row = rows[y];
-    const std::size_t top = static_cast<std::size_t>(row.low) * row_size,
-                      bottom = static_cast<std::size_t>(row.high) * row_size;
-    float* out = to.out + y * to.stride;
-    for (std::size_t x = 0; x < columns.size(); ++x) {
-      const Tap& column = columns[x];
-      const std::size_t left = static_cast<std::size_t>(column.low) * 3,
-                        right = static_cast<std::size_t>(column.high) * 3;
-      const float w00 = row.low_weight * column.low_weight, w01 = row.low_weight * column.high_weight;
-      const float w10 = row.high_weight * column.low_weight, w11 = row.high_weight * column.high_weight;
-      for (std::size_t c = 0; c < 3; ++c) {
-        float sum = w01 * source(top + right + c);
-        sum = std::fma(w00, source(top + left + c), sum);
-        sum = std::fma(w10, source(bottom + left + c), sum);
-        out[c * to.plane + x] = std::fma(w11, source(bottom + right + c), sum);
-      }
+void read(Source source, std::size_t row_size, int row, std::span<const Tap> columns, SourceRow& to) {
+  if (to.row == row) return;
+  to.row = row;
+  const std::size_t first = static_cast<std::size_t>(row) * row_size, width = columns.size();
+  to.left.resize(3 * width), to.right.resize(3 * width);
+  for (std::size_t x = 0; x < width; ++x)
+    for (std::size_t c = 0; c < 3; ++c) {
+      to.left[c * width + x] = source(first + 3 * static_cast<std::size_t>(columns[x].low) + c);
+      to.right[c * width + x] = source(first + 3 * static_cast<std::size_t>(columns[x].high) + c);
     }
+}
+
+/// The weights of all columns.
+struct ColumnWeights {
+  std::vector<float> low, high;
+};
+
+/// A row of the output, of one channel. The loop has no dependence, so that the compiler makes vectors of it.
+inline __attribute__((always_inline)) void sum_row(const Tap& row, const ColumnWeights& columns, const float* top_left,
+                                                   const float* top_right, const float* bottom_left,
+                                                   const float* bottom_right, float* __restrict out) {
+  const float *low = columns.low.data(), *high = columns.high.data();
+  for (std::size_t x = 0; x < columns.low.size(); ++x) {
+    const float w00 = row.low_weight * low[x], w01 = row.low_weight * high[x];
+    const float w10 = row.high_weight * low[x], w11 = row.high_weight * high[x];
+    float sum = w01 * top_right[x];
+    sum = std::fma(w00, top_left[x], sum);
+    sum = std::fma(w10, bottom_left[x], sum);
+    out[x] = std::fma(w11, bottom_right[x], sum);
   }
+}
+
+inline __attribute__((always_inline)) void sum_rows(const Tap& row, const ColumnWeights& columns, const SourceRow& top,
+                                                    const SourceRow& bottom, float* out, std::size_t plane) {
+  const std::size_t width = columns.low.size();
+  for (std::size_t c = 0; c < 3; ++c)
+    sum_row(row, columns, &top.left[c * width], &top.right[c * width], &bottom.left[c * width],
+            &bottom.right[c * width], out + c * plane);
 }
 
 // std::fma gives the same pixels on machines with and without the instruction; without it, it is a slow library
 // function.
 #if defined(__x86_64__)
-template <class Source>
-__attribute__((target("fma"))) void resample_fused(Source source, int source_width, const std::vector<Tap>& rows,
-                                                   const std::vector<Tap>& columns, const Target& to) {
-  resample(source, source_width, rows, columns, to);
+__attribute__((target("fma"))) void sum_rows_fused(const Tap& row, const ColumnWeights& columns, const SourceRow& top,
+                                                   const SourceRow& bottom, float* out, std::size_t plane) {
+  sum_rows(row, columns, top, bottom, out, plane);
 }
 #endif
 
+/// Two neighbouring rows of the source are kept: where the image grows, the next rows of the output read them again.
 template <class Source>
-void place(Source source, int source_width, int source_height, const Target& to) {
-  if (source_width == to.width && source_height == to.height) return copy(source, to);
-  const std::vector<Tap> rows = make_taps(source_height, to.height), columns = make_taps(source_width, to.width);
+void resample(Source source, int source_width, int source_height, const Target& to, Rows rows) {
+  const std::vector<Tap> row_taps = make_taps(source_height, to.height, rows);
+  const std::vector<Tap> column_taps = make_taps(source_width, to.width, {0, to.width});
+  ColumnWeights columns;
+  for (const Tap& tap : column_taps) columns.low.push_back(tap.low_weight), columns.high.push_back(tap.high_weight);
+  SourceRow kept[2];
+  float* out = to.out + static_cast<std::size_t>(rows.first) * to.stride;
+  for (const Tap& row : row_taps) {
+    SourceRow &top = kept[row.low % 2], &bottom = kept[row.high % 2];
+    read(source, static_cast<std::size_t>(source_width) * 3, row.low, column_taps, top);
+    read(source, static_cast<std::size_t>(source_width) * 3, row.high, column_taps, bottom);
 #if defined(__x86_64__)
-  if (__builtin_cpu_supports("fma")) return resample_fused(source, source_width, rows, columns, to);
+    if (__builtin_cpu_supports("fma"))
+      sum_rows_fused(row, columns, top, bottom, out, to.plane);
+    else
 #endif
-  resample(source, source_width, rows, columns, to);
+      sum_rows(row, columns, top, bottom, out, to.plane);
+    out += to.stride;
+  }
+}
+
+template <class Source>
+void place(Source source, int source_width, int source_height, const Target& to, Rows rows) {
+  if (source_width == to.width && source_height == to.height) return copy(source, to, rows);
+  resample(source, source_width, source_height, to, rows);
 }
 
 }  // namespace
@@ -122,15 +163,33 @@ std::vector<std::uint8_t> resized_8bit(const Frame& frame, const Target& target)
   return resample_pillow_bilinear(bytes, frame.width, frame.height, target.width, target.height);
 }
 
-void place(const Frame& frame, const Target& target) {
+void place(const Frame& frame, const Target& target, Rows rows) {
   if (const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb))
-    return place(ByteSource{bytes->data(), byte_table().data()}, frame.width, frame.height, target);
-  place(FloatSource{std::get<std::vector<float>>(frame.rgb).data()}, frame.width, frame.height, target);
+    return place(ByteSource{bytes->data(), byte_table().data()}, frame.width, frame.height, target, rows);
+  place(FloatSource{std::get<std::vector<float>>(frame.rgb).data()}, frame.width, frame.height, target, rows);
+}
+
+/// Fills what is left of the rows beside the image.
+void fill(const Letterbox& to, const Target& target, std::span<float> out, int left, Rows rows, Rows image) {
+  const auto n_left = static_cast<std::size_t>(left), stride = target.stride;
+  const std::size_t end = n_left + static_cast<std::size_t>(target.width);
+  for (std::size_t c = 0; c < 3; ++c)
+    for (int y = rows.first; y < rows.end; ++y) {
+      const std::span<float> row = out.subspan(c * target.plane + static_cast<std::size_t>(y) * stride, stride);
+      const bool crosses = y >= image.first && y < image.end;
+      std::ranges::fill(row.first(crosses ? n_left : stride), to.fill[c]);
+      if (crosses) std::ranges::fill(row.subspan(end), to.fill[c]);
+    }
 }
 
 }  // namespace
 
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where) {
+  return letterbox_rows(frame, to, {0, to.height}, out, where);
+}
+
+Status letterbox_rows(const Frame& frame, const Letterbox& to, Rows rows, std::span<float> out,
+                      const std::string& where) {
   const auto stride = static_cast<std::size_t>(to.width);
   Target target{out.data(), stride * static_cast<std::size_t>(to.height), stride, to.width, to.height};
   if (frame.width != to.width || frame.height != to.height) {
@@ -142,24 +201,25 @@ Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, 
       return Error{Code::bad_observation, where,
                    fmt::format("an image that fits {} x {} with both sides", to.width, to.height),
                    fmt::format("{} x {}, which leaves a side shorter than a pixel", frame.width, frame.height)};
-    for (std::size_t c = 0; c < 3; ++c)
-      std::fill_n(out.begin() + static_cast<std::ptrdiff_t>(c * target.plane), target.plane, to.fill[c]);
   }
   const int share = to.align == Letterbox::Align::center ? 2 : 1;  // share of the padding at the left and top
-  target.out += static_cast<std::size_t>((to.height - target.height) / share) * stride +
-                static_cast<std::size_t>((to.width - target.width) / share);
+  const int top = (to.height - target.height) / share, left = (to.width - target.width) / share;
+  fill(to, target, out, left, rows, {top, top + target.height});
+  target.out += static_cast<std::size_t>(top) * stride + static_cast<std::size_t>(left);
+  // of the image
+  rows = {std::clamp(rows.first - top, 0, target.height), std::clamp(rows.end - top, 0, target.height)};
   if (to.antialias) {
     const std::vector<std::uint8_t> bytes = resized_8bit(frame, target);
-    copy(ByteSource{bytes.data(), byte_table().data()}, target);
+    copy(ByteSource{bytes.data(), byte_table().data()}, target, rows);
   } else {
-    place(frame, target);
+    place(frame, target, rows);
   }
   return {};
 }
 
 void stretch(const Frame& frame, int width, int height, std::span<float> out) {
   const auto stride = static_cast<std::size_t>(width);
-  place(frame, {out.data(), stride * static_cast<std::size_t>(height), stride, width, height});
+  place(frame, {out.data(), stride * static_cast<std::size_t>(height), stride, width, height}, {0, height});
 }
 
 namespace {
@@ -186,10 +246,19 @@ Result<Letterbox> read_letterbox(JsonFields& fields) {
   return op;
 }
 
+struct LetterboxFit final : OneFit<Letterbox> {
+  explicit LetterboxFit(const Letterbox& given) : OneFit("letterboxed", letterbox, given) {}
+  /// Antialiasing makes the whole image before it spreads it over planes.
+  bool makes_rows() const override { return !op.antialias; }
+  Status apply_rows(const Frame& frame, Rows rows, std::span<float> planes, const std::string& where) const override {
+    return letterbox_rows(frame, op, rows, planes, where);
+  }
+};
+
 Status parse(JsonFields& fields, Recipe& recipe) {
   if (recipe.fit != nullptr) return misplaced(fields, "a letterbox as the first and only op on images of any size");
   VLA_TRY(const Letterbox op, read_letterbox(fields));
-  recipe.fit = std::make_unique<OneFit<Letterbox>>("letterboxed", letterbox, op);
+  recipe.fit = std::make_unique<LetterboxFit>(op);
   recipe.width = op.width;
   recipe.height = op.height;
   return {};

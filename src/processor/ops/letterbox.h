@@ -8,6 +8,7 @@
 
 #include "base/result.h"
 #include "processor/image.h"
+#include "processor/ops/op.h"
 
 namespace vla {
 
@@ -36,6 +37,10 @@ struct Letterbox {
 ///
 /// Errors: bad_observation when a side of the resized image is shorter than a pixel.
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where);
+
+/// The same for some rows of `out`, which stays as it is elsewhere.
+Status letterbox_rows(const Frame& frame, const Letterbox& to, Rows rows, std::span<float> out,
+                      const std::string& where);
 
 /// The same resampling to `width` x `height` without keeping the aspect.
 void stretch(const Frame& frame, int width, int height, std::span<float> out);

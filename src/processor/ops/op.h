@@ -39,6 +39,11 @@ struct CameraSize {
   int height = 0;
 };
 
+/// Rows of an image, without `end`.
+struct Rows {
+  int first, end;
+};
+
 /// Makes planes of the network's size from a frame of any size.
 class Fit {
  public:
@@ -54,6 +59,13 @@ class Fit {
   virtual std::int64_t work(int /*width*/, int /*height*/) const { return 0; }
   /// Writes (3, height, width) float32 in [0, 1] for this view. Errors: bad_observation, at `where`.
   virtual Status apply(const Frame& frame, int view, std::span<float> planes, const std::string& where) const = 0;
+  /// Whether it makes some rows of the planes alone, of any view, as fast as all of them together.
+  virtual bool makes_rows() const { return false; }
+  /// Writes these rows of `planes`, where it does. Errors: those of `apply`.
+  virtual Status apply_rows(const Frame& frame, Rows /*rows*/, std::span<float> planes,
+                            const std::string& where) const {
+    return apply(frame, 0, planes, where);
+  }
 };
 
 /// A fit by one function of what the recipe says.
@@ -75,7 +87,7 @@ class OneFit : public Fit {
   Run* run_;
 };
 
-/// Works on planes (3, height, width).
+/// Changes each value of an image alone, by its channel.
 class PlaneOp {
  public:
   static constexpr int kEveryView = -1;
@@ -83,7 +95,7 @@ class PlaneOp {
   virtual ~PlaneOp() = default;
   /// The view that it applies to: an index into the bundle's views, or kEveryView.
   virtual int view() const { return kEveryView; }
-  virtual void apply(std::span<float> planes) const = 0;
+  virtual void apply(std::span<float> values, std::size_t channel) const = 0;
 };
 
 class TextOp {

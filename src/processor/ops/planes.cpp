@@ -21,18 +21,17 @@ void standardize_in_bf16(std::span<float> plane, float mean, float divisor) {
 
 void standardize(std::span<float> pixels, const Standardize& op) {
   const std::size_t size = pixels.size() / op.mean.size();
-  for (std::size_t c = 0; c < op.mean.size(); ++c) {
-    const std::span<float> plane = pixels.subspan(c * size, size);
-    if (op.arithmetic == Standardize::Arithmetic::bfloat16) {
-      standardize_in_bf16(plane, rounded(op.mean[c]), rounded(op.std[c]));
-      continue;
-    }
-    const float unit = op.arithmetic == Standardize::Arithmetic::float32_in_bytes ? 255.0f : 1.0f;
-    const float mean = unit * op.mean[c], divisor = unit * op.std[c];
-    for (float& x : plane) x = (unit * x - mean) / divisor;
-    if (op.arithmetic == Standardize::Arithmetic::float32_then_bfloat16)
-      for (float& x : plane) x = rounded(x);
-  }
+  for (std::size_t c = 0; c < op.mean.size(); ++c) standardize(pixels.subspan(c * size, size), c, op);
+}
+
+void standardize(std::span<float> plane, std::size_t channel, const Standardize& op) {
+  if (op.arithmetic == Standardize::Arithmetic::bfloat16)
+    return standardize_in_bf16(plane, rounded(op.mean[channel]), rounded(op.std[channel]));
+  const float unit = op.arithmetic == Standardize::Arithmetic::float32_in_bytes ? 255.0f : 1.0f;
+  const float mean = unit * op.mean[channel], divisor = unit * op.std[channel];
+  for (float& x : plane) x = (unit * x - mean) / divisor;
+  if (op.arithmetic == Standardize::Arithmetic::float32_then_bfloat16)
+    for (float& x : plane) x = rounded(x);
 }
 
 void affine(std::span<float> values, float scale, float shift) {
@@ -50,19 +49,19 @@ namespace {
 
 struct AffineOp final : PlaneOp {
   float scale = 1.0f, shift = 0.0f;
-  void apply(std::span<float> planes) const override { affine(planes, scale, shift); }
+  void apply(std::span<float> values, std::size_t) const override { affine(values, scale, shift); }
 };
 
 struct ClipOp final : PlaneOp {
   float low = 0.0f, high = 0.0f;
-  void apply(std::span<float> planes) const override { clip(planes, low, high); }
+  void apply(std::span<float> values, std::size_t) const override { clip(values, low, high); }
 };
 
 struct StandardizeOp final : PlaneOp {
   Standardize by;
   int of_view = kEveryView;
   int view() const override { return of_view; }
-  void apply(std::span<float> planes) const override { standardize(planes, by); }
+  void apply(std::span<float> values, std::size_t channel) const override { standardize(values, channel, by); }
 };
 
 Status read(JsonFields& fields, AffineOp& op) {

@@ -21,6 +21,8 @@ struct Standardize {
 /// torch's element-wise arithmetic; in bytes: transformers image_processing_utils_fast.py
 /// (_fuse_mean_std_and_rescale_factor).
 void standardize(std::span<float> pixels, const Standardize& op);
+/// The same for values of one channel.
+void standardize(std::span<float> plane, std::size_t channel, const Standardize& op);
 
 /// `x * scale + shift`, each rounded to float32, in place.
 void affine(std::span<float> values, float scale, float shift);
