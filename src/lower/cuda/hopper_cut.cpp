@@ -16,40 +16,40 @@ struct Rates {
   double of_sm;          // bytes that an SM reads from the L2 cache
   double least;          // least time of a step of the depth
   double kernel, block;  // fixed costs of the kernel and of a block
+  double first_end;      // of a block that ends in results: instructions that no block before has read
   double end, share;     // per result of a block, and per sum of a share of the depth
-  double finish;         // fixed cost of the kernel that adds shares of the depth
   double further;        // the fraction of a block's time that each further block on an SM adds
 };
-// Fitted to measurements on an H200: bf16 to 999 products of 50 to 968 rows with float32 results, codes to 656 (85 % of
-// the ternary and all but a tenth of the int8 ones within a sixth). The results of codes then took 4 to 6e-4, nearly
-// all of it divisions that are gone now; 1e-4 is an estimate.
+// Fitted to measurements on an H200: bf16 to 999 products of 50 to 968 rows with float32 results, int8 to 214 and
+// ternary to 442. Those of codes are within 8 and 11 % (root mean square). A block of codes that ends in results takes
+// longer than all of its products: shares of the depth pay already where there are few blocks.
 constexpr Rates kBf16 = {.sums = 38.9e3,
                          .of_sm = 60.8e3,
                          .least = 0.355,
                          .kernel = 1.2,
                          .block = 1.3,
+                         .first_end = 0,
                          .end = 4.4e-5,
                          .share = 4.4e-5,
-                         .finish = 0,
                          .further = 1};
-constexpr Rates kTernary = {.sums = 32.8e3,
-                            .of_sm = 61.5e3,
-                            .least = 0.2,
-                            .kernel = 4.45,
-                            .block = 0.12,
-                            .end = 1e-4,
+constexpr Rates kTernary = {.sums = 32.4e3,
+                            .of_sm = 55.9e3,
+                            .least = 0.186,
+                            .kernel = 4.12,
+                            .block = 0.18,
+                            .first_end = 1.15,
+                            .end = 5.5e-4,
                             .share = 0,
-                            .finish = 0,
-                            .further = 1.25};
-constexpr Rates kInt8 = {.sums = 74.3e3,
-                         .of_sm = 51.4e3,
+                            .further = 1.13};
+constexpr Rates kInt8 = {.sums = 104e3,
+                         .of_sm = 51e3,
                          .least = 0,
-                         .kernel = 2.65,
-                         .block = 0.29,
-                         .end = 1e-4,
-                         .share = 2.3e-5,
-                         .finish = 0,
-                         .further = 1.17};
+                         .kernel = 2.64,
+                         .block = 0.09,
+                         .first_end = 1.76,
+                         .end = 6.9e-4,
+                         .share = 2.8e-5,
+                         .further = 1.12};
 constexpr double kWritten = 2.5e6;  // bytes that all SMs write to memory in a microsecond
 
 /// A tile of a table, and the bytes that a step of 128 bytes of the depth reads.
@@ -82,21 +82,26 @@ std::int64_t ceil_of(std::int64_t n, std::int64_t size) { return (n + size - 1) 
 
 ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
                           HopperCutFor what, int n_sm) {
-  const std::int64_t n_step = ceil_of(depth, kind == MatrixKind::bf16 ? cuda::kHopperDepth : cuda::kHopperInt8Depth);
-  const Rates& rates = kind == MatrixKind::bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
+  const bool is_bf16 = kind == MatrixKind::bf16;
+  const std::int64_t n_step = ceil_of(depth, is_bf16 ? cuda::kHopperDepth : cuda::kHopperInt8Depth);
+  const Rates& rates = is_bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
   ProductCut best = {ProductShape::hopper, 1, 0, std::numeric_limits<double>::max()};
   for (const Candidate& tile : candidates(kind, what))
     for (const int n_split : {1, 2, 3, 4, 6, 8}) {
-      if (n_split > 1 && n_step / n_split < 4) break;
+      // As far as was measured: shares of codes down to a step, but then four at most, and no more than SMs may need.
+      const std::int64_t n_whole = ceil_of(n_row, tile.rows) * ceil_of(n_column, tile.columns);
+      if (n_split > 1 && n_step / n_split < (is_bf16 || n_split > 4 ? 4 : 1)) break;
+      if (!is_bf16 && n_whole * (n_split - 1) > 2 * n_sm) break;
       const auto size = static_cast<double>(tile.columns * tile.rows);
+      const auto n_result = static_cast<double>(tile.columns * std::min(tile.rows, n_row));
       const double of_step =
           std::max({size / rates.sums, static_cast<double>(tile.step_bytes) / rates.of_sm, rates.least});
       const double of_block = rates.block + static_cast<double>(ceil_of(n_step, n_split)) * of_step +
-                              (n_split == 1 ? rates.end : rates.share) * size;
-      const std::int64_t n_block = ceil_of(n_row, tile.rows) * ceil_of(n_column, tile.columns) * n_split;
+                              (n_split == 1 ? rates.first_end + rates.end * n_result : rates.share * size);
+      const std::int64_t n_block = n_whole * n_split;
       const auto n_wave = static_cast<double>(ceil_of(n_block, n_sm));
       double us = rates.kernel + of_block * (1 + rates.further * (n_wave - 1));
-      if (n_split > 1) us += rates.finish + static_cast<double>(4 * n_row * n_column * (n_split + 1)) / kWritten;
+      if (n_split > 1) us += static_cast<double>(4 * n_row * n_column * (n_split + 1)) / kWritten;
       if (us < best.us) best.n_split = n_split, best.tile = tile.index, best.us = us;
     }
   return best;

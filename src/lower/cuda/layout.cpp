@@ -272,7 +272,7 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
     const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
     return tiles.us + kFork < strips.us ? tiles : strips;
   }
-  if (has_tiles && n_row > 64) return cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
+  if (has_tiles) return cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
   const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
   const ProductShape shape = is_few                          ? ProductShape::few
                              : n_row > 64 && n_large >= n_sm ? ProductShape::rows128
@@ -280,9 +280,10 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
   if (kind == MatrixKind::f32) return {shape, 1};
   std::int64_t n_block = shape == ProductShape::rows128 ? n_large : blocks_of(n_row, n_column, 64, 64);
   if (is_few) n_block = blocks_of(1, n_column, 1, is_bf16 ? 8 : 128);
-  // A share has 8 steps or more; the depth is split only if there are fewer blocks than run at a time.
-  const std::int64_t step = is_bf16 ? cuda::kBf16Depth : cuda::Int8Tile::kDepth;
-  const std::int64_t most = std::max<std::int64_t>((depth + step - 1) / step / 8, 1);
+  // A share has a few steps or more; the depth is split only if there are fewer blocks than run at a time. A step of
+  // codes has twice the depth, and the kernel that ends many shares is faster than the end of a few blocks.
+  const std::int64_t step = is_bf16 ? cuda::kBf16Depth : cuda::Int8Tile::kDepth, least = is_bf16 ? 8 : 3;
+  const std::int64_t most = std::max<std::int64_t>((depth + step - 1) / step / least, 1);
   return {shape, static_cast<int>(std::clamp<std::int64_t>(n_sm / std::max<std::int64_t>(n_block, 1), 1, most))};
 }
 
