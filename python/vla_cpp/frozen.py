@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import threading
-import zlib
 from typing import Dict, Mapping, Tuple
 
 import numpy as np
@@ -23,7 +22,7 @@ class CameraWatch:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._seen: Dict[Tuple[str, str], Tuple[int, np.ndarray, int]] = {}  # checksum, state when it came, acts since
+        self._seen: Dict[Tuple[str, str], Tuple[bytes, np.ndarray, int]] = {}  # picture, state when it came, acts since
 
     def notes(self, spec: Spec, images: Mapping[str, Image], state: State) -> Tuple[str, ...]:
         """A note for each view whose picture stays the same to the byte although the state does not. An observation that the policy
@@ -39,14 +38,14 @@ class CameraWatch:
                 f"view {name}: the same picture in {n} acts, while the state moved: does the camera still run?"
                 for name, data in pictures.items()
                 if data is not None
-                for n in [self._count((spec.embodiment, name), zlib.crc32(data), position)]
+                for n in [self._count((spec.embodiment, name), bytes(data), position)]
                 if n >= N_SAME
             )
 
-    def _count(self, key: Tuple[str, str], checksum: int, position: np.ndarray) -> int:
+    def _count(self, key: Tuple[str, str], picture: bytes, position: np.ndarray) -> int:
         """Acts with this picture, 0 while the state is where it was when the picture came."""
         known, start, n = self._seen.get(key, (None, position, 0))
-        if known != checksum or start.shape != position.shape:
+        if known != picture or start.shape != position.shape:
             start, n = position, 0
-        self._seen[key] = checksum, start, n + 1
+        self._seen[key] = picture, start, n + 1
         return n + 1 if position.size and np.abs(position - start).max() > MOVED else 0
