@@ -174,11 +174,11 @@ Status Engine::take_injected(const std::vector<Tap>& given) {
 
 Status Engine::inject_inputs(Inputs& inputs) const {
   for (const Tap& tap : injected_input_) {
-    std::vector<float>& input = tap.path == "state" ? inputs.state : inputs.pixels;
+    const std::span<float> input = tap.path == "state" ? std::span(inputs.state) : std::span(inputs.pixels);
     if (tap.values.size() != input.size())
       return Error{Code::bad_observation, "injected " + tap.path, fmt::format("{} numbers", input.size()),
                    std::to_string(tap.values.size())};
-    input = tap.values;
+    std::ranges::copy(tap.values, input.begin());
   }
   for (const auto* taps : {&injected_input_, &injected_})
     for (const Tap& tap : *taps) inputs.notes.push_back(tap.path + " was injected, not computed");
@@ -191,9 +191,9 @@ Status Engine::set_steps(int n_step) {
   return make_plans(dry_);
 }
 
-template <class T>
+template <class Values>
 void Engine::record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
-                    const std::vector<T>& values) const {
+                    const Values& values) const {
   if (match_path(tap_pattern_, path)) taps.push_back({path, std::move(shape), {values.begin(), values.end()}});
 }
 
@@ -232,6 +232,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
 Status Engine::encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                       EncodedObservation& to) const noexcept try {
   to.pixels_ahead.reset(), to.is_late = {};
+  to.inputs.pixels.take_from([device = device_.get()](std::size_t n) { return device->host_memory(n); });
   VLA_TRY(to.robot, robot(observation.embodiment));
   VLA_CHECK(
       to.robot->encode(observation, noise, leftover, to, image_threads_ ? run_items(*image_threads_) : one_by_one));
@@ -241,7 +242,7 @@ Status Engine::encode(const Observation& observation, const Noise& noise, const 
 }
 
 Status Engine::send_ahead(EncodedObservation& encoded) const noexcept try {
-  const std::vector<float>& pixels = encoded.inputs.pixels;
+  const Pixels& pixels = encoded.inputs.pixels;
   if (!pixels.empty()) encoded.pixels_ahead = device_->send(pixels.data(), pixels.size() * sizeof(float));
   return {};
 } catch (const std::bad_alloc&) {

@@ -144,9 +144,8 @@ class Engine {
   Result<ActionChunk> run(EncodedObservation& encoded);
   Status solve(Plan& plan, int most, const std::function<bool()>& is_late, std::vector<Tap>& taps);
   void show(std::vector<Tap>& taps) const;
-  template <class T>
-  void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
-              const std::vector<T>& values) const;
+  template <class Values>
+  void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape, const Values& values) const;
 
   std::string tap_pattern_;
   std::function<void(const Graph&)> see_graph_;

@@ -135,8 +135,13 @@ class Device {
   }
   /// Allocates slots, filled with zeros. Errors: out_of_memory.
   virtual Status allocate(Slots& slots) = 0;
+  /// The caller may reuse the bytes at once, except those of host_memory.
   virtual void set(const Slot& slot, const void* data, std::size_t size) = 0;
   virtual void get(const Slot& slot, void* data, std::size_t size) const = 0;
+  /// Memory that the device reads by itself, so that `set` copies none of it: its values must stay until a result that
+  /// used them was read. It may outlive the device. Any thread may ask for it. Null if the device or its memory cannot
+  /// do this.
+  virtual std::shared_ptr<float[]> host_memory(std::size_t /*n*/) { return nullptr; }
   /// Bytes that were sent ahead to a device while it computes. They must stay until a result that used them was read.
   class Sent {
    public:

@@ -16,6 +16,7 @@
 #include "processor/action_tokens.h"
 #include "processor/image.h"
 #include "processor/names.h"
+#include "processor/pixels.h"
 #include "processor/recipe.h"
 #include "processor/tokenizer.h"
 
@@ -35,7 +36,7 @@ struct Inputs {
   int n_view = 0;
   std::uint64_t views = 0;  // bit i: view i of the bundle's order is present
   int height = 0, width = 0;
-  std::vector<float> pixels;           // (n_view, 3, height, width), present views only, in the bundle's order
+  Pixels pixels;                       // (n_view, 3, height, width), present views only, in the bundle's order
   std::vector<std::int32_t> tokens;    // at most `recipe().max_tokens`
   std::vector<float> state;            // normalized, padded; empty where the network sees none
   std::vector<int> discretized_state;  // where the prompt has a place for it

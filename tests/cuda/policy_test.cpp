@@ -170,7 +170,9 @@ TEST_CASE_FIXTURE(Driver, "an act of a size that was warmed up makes no graph, a
   for (const ActShape& size : sizes) REQUIRE(engine->warm_up(size));
   const Counts before = fake_driver().n_call;
   REQUIRE(engine->act(golden.observation, golden.noise, leftover).ok());
-  CHECK(calls_since(before) == kAct);
+  Counts first = kAct;
+  first["cuMemHostAlloc"] = 1;  // of the images, which later acts keep
+  CHECK(calls_since(before) == first);
   golden.observation.text = "to";
   CHECK(engine->act(golden.observation, golden.noise).ok());
   CHECK(calls_since(before)["cuGraphInstantiateWithFlags"] == 0);
@@ -180,6 +182,24 @@ TEST_CASE_FIXTURE(Driver, "an act of a size that was warmed up makes no graph, a
   CHECK(engine->warm_up(other).error().code == Code::bad_observation);
   other = sizes[0], other.embodiment = "absent";
   CHECK(engine->warm_up(other).error().code == Code::bad_observation);
+}
+
+TEST_CASE_FIXTURE(Driver, "an observation keeps the memory of its images, also when the engine is gone") {
+  reset_without_computing();
+  const GoldenCase golden = small_case();
+  {
+    EncodedObservation act;
+    {
+      const auto engine = load_engine(golden.bundle(), "", "float32");
+      REQUIRE(engine->encode(golden.observation, golden.noise, {}, act).ok());
+      const float* pixels = act.inputs.pixels.data();
+      REQUIRE(engine->encode(golden.observation, golden.noise, {}, act).ok());
+      CHECK(act.inputs.pixels.data() == pixels);
+    }
+    CHECK(act.inputs.pixels.front() >= -1);
+    CHECK_FALSE(nothing_is_held());
+  }
+  CHECK(nothing_is_held());
 }
 
 TEST_CASE_FIXTURE(Driver, "images of an act that is prepared travel before the act before is computed") {

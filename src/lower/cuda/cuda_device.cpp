@@ -83,6 +83,12 @@ void CudaDevice::set(const Slot& slot, const void* data, std::size_t size) {
   queue_->set(reinterpret_cast<cuda::Address>(slot.place), data, size);
 }
 
+std::shared_ptr<float[]> CudaDevice::host_memory(std::size_t n) {
+  std::shared_ptr<std::byte> memory = queue_->host_memory(n * sizeof(float));
+  auto* floats = reinterpret_cast<float*>(memory.get());
+  return {std::move(memory), floats};
+}
+
 void CudaDevice::take(const Slot& slot, const Sent& sent) {
   queue_->take(reinterpret_cast<cuda::Address>(slot.place), static_cast<const CudaSent&>(sent), slot.size());
 }

@@ -23,6 +23,7 @@ class CudaDevice final : public Device {
   Status allocate(Slots& slots) override;
   void set(const Slot& slot, const void* data, std::size_t size) override;
   void get(const Slot& slot, void* data, std::size_t size) const override;
+  std::shared_ptr<float[]> host_memory(std::size_t n) override;
   std::unique_ptr<Sent> send(const void* data, std::size_t size) override { return queue_->send(data, size); }
   void take(const Slot& slot, const Sent& sent) override;
   Status failure() const override { return queue_->failure(); }

@@ -15,6 +15,8 @@ constexpr std::size_t kStreams = 4;
 constexpr std::size_t kMaxLaunches = 20000;
 /// Alignment of slots; a smaller gap between two slots is padding.
 constexpr std::size_t kPadding = 256;
+/// Room behind images for what else an act uploads: tokens, state and noise.
+constexpr std::size_t kRoom = std::size_t{256} << 10;
 
 std::size_t n_launch(const CudaPart& part) {
   std::size_t n = 0;
@@ -94,28 +96,69 @@ void CudaQueue::set(cuda::Address to, const void* from, std::size_t size) {
 Status CudaQueue::stage(cuda::Address to, const void* from, std::size_t size) {
   VLA_CHECK(gpu_->use());
   VLA_CHECK(launch());  // queued work reads the old bytes
+  VLA_TRY(std::shared_ptr<HostBlock> block, block_of(from));
+  if (block) {
+    uploads_.push_back({to, static_cast<std::byte*>(const_cast<void*>(from)), size, std::move(block)});
+    return {};
+  }
   std::size_t gap = kPadding;
   if (!uploads_.empty()) {
     const cuda::Address end = uploads_.back().to + uploads_.back().size;
     if (to >= end && to - end < kPadding) gap = static_cast<std::size_t>(to - end);
   }
-  const bool joins = gap < kPadding;
+  if (gap < kPadding) {
+    Upload& last = uploads_.back();
+    const HostMemory& memory = last.block ? last.block->memory : staging_;
+    std::byte* end = last.from + last.size;
+    if (end + gap + size <= memory.at(memory.size)) {
+      std::memset(end, 0, gap);
+      std::memcpy(end + gap, from, size);
+      last.size += gap + size;
+      if (!last.block) n_staged_ += gap + size;
+      return {};
+    }
+  }
   if (n_staged_ + size + kPadding > staging_.size) {  // grow until all inputs of an act fit
     const std::size_t enough = 2 * (n_staged_ + size) + kPadding;
     VLA_CHECK(start_uploads());
     VLA_CHECK(wait());
     VLA_CHECK(grow(staging_, enough));
-    return stage(to, from, size);
   }
-  if (joins) {
-    std::memset(staging_.at(n_staged_), 0, gap);
-    uploads_.back().size += gap + size, n_staged_ += gap;
-  } else {
-    uploads_.push_back({to, n_staged_, size});
-  }
+  uploads_.push_back({to, staging_.at(n_staged_), size, nullptr});
   std::memcpy(staging_.at(n_staged_), from, size);
   n_staged_ += size;
   return {};
+}
+
+std::shared_ptr<std::byte> CudaQueue::host_memory(std::size_t size) {
+  if (is_dry_) return nullptr;
+  const std::lock_guard lock(blocks_mutex_);
+  Result<std::shared_ptr<HostBlock>> made = make_block(size + kRoom);
+  if (made) {
+    std::byte* begin = (*made)->memory.at(0);
+    return {std::move(*made), begin};
+  }
+  // Without such memory, bytes are copied to what the queue has.
+  if (made.error().code != Code::out_of_memory && block_failure_) block_failure_ = made.error();
+  return nullptr;
+}
+
+Result<std::shared_ptr<CudaQueue::HostBlock>> CudaQueue::make_block(std::size_t size) {
+  auto block = std::make_shared<HostBlock>(gpu_);
+  VLA_CHECK(grow(block->memory, size));
+  std::erase_if(blocks_, [](const auto& known) { return known.expired(); });
+  blocks_.push_back(block);
+  return block;
+}
+
+/// The block that `from` lies in, or null.
+Result<std::shared_ptr<CudaQueue::HostBlock>> CudaQueue::block_of(const void* from) {
+  const std::lock_guard lock(blocks_mutex_);
+  VLA_CHECK(block_failure_);
+  for (const auto& known : blocks_)
+    if (std::shared_ptr<HostBlock> block = known.lock())
+      if (from >= block->memory.at(0) && from < block->memory.at(block->memory.size)) return block;
+  return std::shared_ptr<HostBlock>();
 }
 
 std::unique_ptr<CudaSent> CudaQueue::send(const void* data, std::size_t size) {
@@ -179,7 +222,9 @@ Status CudaQueue::record(const cuda::Owned& event) {
 }
 
 Status CudaQueue::start_uploads() {
-  for (const Upload& upload : uploads_) VLA_CHECK(main_->upload(upload.to, staging_.at(upload.begin), upload.size));
+  for (const Upload& upload : uploads_) VLA_CHECK(main_->upload(upload.to, upload.from, upload.size));
+  for (Upload& upload : uploads_)
+    if (upload.block) read_.push_back(std::move(upload.block));
   uploads_.clear();
   return {};
 }
@@ -198,6 +243,7 @@ Status CudaQueue::launch() {
 
 Status CudaQueue::wait() {
   VLA_CHECK(main_->wait());
+  read_.clear();
   if (uploads_.empty()) n_staged_ = 0;
   return {};
 }

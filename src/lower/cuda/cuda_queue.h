@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <map>
 #include <memory>
+#include <mutex>
 #include <string>
 #include <vector>
 
@@ -65,7 +66,11 @@ class CudaQueue {
   Status fill_zeros(const cuda::Buffer& memory);
   /// For a mark.
   Result<cuda::Owned> event();
-  /// Copies bytes to the device before the next launch; `from` may be reused at once. Adjacent copies are joined.
+  /// Memory that the device reads by itself, and that outlives the queue. Any thread may ask for it. Null if the queue
+  /// is dry or memory is short; a failure is kept by the next call.
+  std::shared_ptr<std::byte> host_memory(std::size_t size);
+  /// Copies bytes to the device before the next launch. `from` may be reused at once; of `host_memory` it is read when
+  /// the copy runs. Adjacent copies are joined.
   void set(cuda::Address to, const void* from, std::size_t size);
   /// Sends bytes ahead of the act that reads them, from any thread. Null if the queue is dry or memory is short.
   std::unique_ptr<CudaSent> send(const void* data, std::size_t size);
@@ -97,13 +102,24 @@ class CudaQueue {
     std::size_t size = 0;
     std::byte* at(std::size_t offset) const { return static_cast<std::byte*>(memory.get()) + offset; }
   };
+  /// What host_memory() gave, with room behind it for the other inputs of an act, which go up with it.
+  struct HostBlock {
+    std::shared_ptr<cuda::Gpu> gpu;
+    HostMemory memory = {};
+    explicit HostBlock(std::shared_ptr<cuda::Gpu> of) : gpu(std::move(of)) {}
+    ~HostBlock() { static_cast<void>(gpu->use()); }
+  };
   struct Upload {
     cuda::Address to;
-    std::size_t begin, size;  // in staging_
+    std::byte* from;
+    std::size_t size;
+    std::shared_ptr<HostBlock> block;  // that `from` lies in; null: staging_
   };
 
   Status grow(HostMemory& memory, std::size_t size);
   Status stage(cuda::Address to, const void* from, std::size_t size);
+  Result<std::shared_ptr<HostBlock>> block_of(const void* from);
+  Result<std::shared_ptr<HostBlock>> make_block(std::size_t size);
   Status copy(cuda::Address to, const CudaSent& sent, std::size_t size);
   Status download(void* to, cuda::Address from, std::size_t size);
   Status start_uploads();
@@ -125,6 +141,10 @@ class CudaQueue {
   HostMemory staging_, landing_;
   std::size_t n_staged_ = 0;  // bytes that queued copies still read
   std::vector<Upload> uploads_;
+  std::vector<std::shared_ptr<HostBlock>> read_;  // blocks that started copies may still read
+  std::mutex blocks_mutex_;
+  std::vector<std::weak_ptr<HostBlock>> blocks_;
+  Status block_failure_;
   Parts pending_, launched_;
   std::size_t n_pending_ = 0;  // launches
   std::map<Parts, cuda::Owned> graphs_;
