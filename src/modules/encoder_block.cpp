@@ -20,7 +20,8 @@ Film::Film(const Scope& s, int d_condition, int d_model)
       shift_(s / "film_shift", d_condition, d_model, Bias::yes) {}
 
 Tensor Film::operator()(Graph& g, Tensor x, Tensor condition) const {
-  return add(g, multiply(g, x, scale_(g, condition)), shift_(g, condition));
+  const Tensor scaled = multiply(g, x, scale_(g, condition));
+  return add(g, scaled, shift_(g, condition));
 }
 
 EncoderBlock::EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps, EncoderFamily family,

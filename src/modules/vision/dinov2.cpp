@@ -34,7 +34,8 @@ Status DinoV2::check(int width, int height) const {
 }
 
 Tensor DinoV2::operator()(Graph& g, Tensor images, Tensor condition) const {
-  const Tensor patches = add(g, patch_embed_(g, images), position_(g, arange(g, n_patch())));
+  const Tensor embedded = patch_embed_(g, images);
+  const Tensor patches = add(g, embedded, position_(g, arange(g, n_patch())));
   std::vector<Tensor> tokens = {g.parameter(class_token_)};
   if (registers_) tokens.push_back((*registers_)(g, arange(g, n_register_)));
   Tensor x = prepend_tokens(g, concat_tokens(g, tokens), patches);

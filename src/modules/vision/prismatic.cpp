@@ -32,7 +32,9 @@ Status PrismaticVision::check(int width, int height, int n_text) const {
 }
 
 Tensor PrismaticVision::operator()(Graph& g, Tensor images, Tensor condition) const {
-  const Tensor patches = concat_features(g, dino_(g, images, condition), siglip_(g, images, condition));
+  // One after the other, so that the graph's order is no compiler's choice.
+  const Tensor of_dino = dino_(g, images, condition), of_siglip = siglip_(g, images, condition);
+  const Tensor patches = concat_features(g, of_dino, of_siglip);
   const Tensor hidden = activate(g, projector_up_(g, patches), Activation::gelu_erf);
   const Tensor mid = activate(g, projector_mid_(g, hidden), Activation::gelu_erf);
   const Tensor tokens = flatten_views(g, projector_down_(g, mid));
