@@ -12,8 +12,6 @@
 #include <utility>
 
 #include "base/process.h"
-#include "kernels/cores.h"
-#include "kernels/executor.h"
 
 namespace vla {
 namespace {
@@ -21,26 +19,6 @@ namespace {
 /// What one process has more than another that does the same: pages of its files that the system brings along, and a
 /// page of 2 MB where the allocator's memory happens to fill one. Measured: 2.1 MB.
 constexpr std::size_t kProcessesDiffer = std::size_t{3} << 20;
-
-/// Most threads that prepare images for another device. More of them wait for each other and for memory.
-constexpr std::size_t kImageThreads = 8;
-
-/// Threads that prepare images while no kernel needs the cores; null for the CPU, whose own threads would wait.
-Result<std::shared_ptr<kernels::Executor>> image_threads(const Device& device, int n_thread) {
-  const std::size_t n_core = kernels::big_cores(kernels::allowed_cores()).size();
-  const std::size_t n = std::min(n_thread > 0 ? static_cast<std::size_t>(n_thread) : n_core, kImageThreads);
-  if (device.is_host() || n < 2) return std::shared_ptr<kernels::Executor>();
-  return kernels::Executor::shared(static_cast<int>(n));
-}
-
-RunItems run_items(kernels::Executor& executor) {
-  return [&executor](std::size_t n, const std::function<void(std::size_t)>& item) {
-    const auto task = kernels::task_of(
-        static_cast<std::int64_t>(n), [&item](std::int64_t i, kernels::Worker&) { item(static_cast<std::size_t>(i)); });
-    const kernels::Phase phase{{task.get()}};
-    executor.run({&phase, 1});
-  };
-}
 
 /// Turns std::bad_alloc of containers into an error: the act fails, and the next one starts from scratch. The strings
 /// fit into the small-string buffers.
@@ -65,8 +43,8 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   malloc_trim(0);  // reading a large vocabulary takes hundreds of megabytes
   VLA_TRY(engine->device_, options.model.empty() ? open_device(options.n_thread, options.kernels, options.device)
                                                  : open_model(options.model, options.kernels, options.device));
-  if (!options.dry) {
-    VLA_TRY(engine->image_threads_, image_threads(*engine->device_, options.n_thread));
+  if (!options.dry && !engine->device_->is_host()) {  // the CPU's own threads would wait for others
+    VLA_TRY(engine->host_threads_, HostThreads::start(options.n_thread));
   }
   WeightPlan plan;
   if (options.memory > 0) {
@@ -234,8 +212,8 @@ Status Engine::encode(const Observation& observation, const Noise& noise, const 
   to.pixels_ahead.reset(), to.is_late = {};
   to.inputs.pixels.take_from([device = device_.get()](std::size_t n) { return device->host_memory(n); });
   VLA_TRY(to.robot, robot(observation.embodiment));
-  VLA_CHECK(
-      to.robot->encode(observation, noise, leftover, to, image_threads_ ? run_items(*image_threads_) : one_by_one));
+  VLA_CHECK(to.robot->encode(observation, noise, leftover, to,
+                             [this](std::size_t n, const auto& item) { host_threads_.run(n, item); }));
   return inject_inputs(to.inputs);
 } catch (const std::bad_alloc&) {
   return no_memory();

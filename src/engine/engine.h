@@ -10,14 +10,11 @@
 #include <vector>
 
 #include "devices/devices.h"
+#include "devices/host_threads.h"
 #include "engine/robot.h"
 #include "graph/rounding.h"
 
 namespace vla {
-
-namespace kernels {
-class Executor;
-}
 
 struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
@@ -154,7 +151,7 @@ class Engine {
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads
   std::unique_ptr<Device> device_;   // goes after what it made
-  std::shared_ptr<kernels::Executor> image_threads_;
+  HostThreads host_threads_;         // none on the CPU
   std::vector<std::unique_ptr<Robot>> robots_;
   std::optional<Plans> plans_;
   std::optional<std::pair<const Robot*, InputShape>> last_;

@@ -119,6 +119,7 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs, 
                       *name, frame->orientation));
     if (const auto note = codecs::suspicious(*frame)) inputs.notes.push_back(fmt::format("{}: {}", *name, *note));
   }
+  if (present.empty()) return {};
   const int n_row = recipe_.fit->makes_rows() ? std::min(kBand, recipe_.height) : recipe_.height;
   const auto n_band = static_cast<std::size_t>((recipe_.height + n_row - 1) / n_row);
   std::vector<Status> made(present.size() * n_band);

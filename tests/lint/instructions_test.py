@@ -20,7 +20,7 @@ INSTRUCTIONS = re.compile(r"_(avx2|avx512|avx512_bf16|amx)\.cpp\.o$")
 BETTER = re.compile(r"%(zmm|tmm|k[1-7]\b|[xy]mm(1[6-9]|2\d|3[01])\b)")
 WIDE = re.compile(r"%ymm")
 # Look at the processor themselves, at run time, before they call a function that is compiled so.
-ASKS = {"resample_torch.cpp.o", "peak_probes.cpp.o"}
+ASKS = {"letterbox.cpp.o", "resample_torch.cpp.o", "peak_probes.cpp.o"}
 # All assembler: the pretended machine is of no maker for which it is chosen (tests/support/amx_processor.cpp).
 NOT_EMULATED = {"int8_lookup_avx512"}
 
