@@ -7,6 +7,8 @@
 
 namespace vla::cuda {
 
+constexpr int kMostSplits = 8;  // shares of the depth that are added at once
+
 /// Operands that change nothing, in the place of those that an epilogue lacks: x + -0 is x, for zeros of both signs
 /// too.
 constexpr float kAddsNothing = -0.0f, kScalesNothing = 1;
@@ -128,6 +130,32 @@ VLA_DEVICE void store_y(const Epilogue& e, std::int64_t row, int column, const F
                              static_cast<unsigned>(dev::bits_of(y.of[2])),
                              static_cast<unsigned>(dev::bits_of(y.of[3]))};
   store_four(static_cast<unsigned*>(e.y) + at, words, together, n);
+}
+
+/// Whether what an epilogue reads and writes consists of aligned fours.
+VLA_DEVICE bool is_of_fours(const Epilogue& e, int n_column) {
+  const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
+  const auto all = bits(e.bias) | bits(e.factor) | bits(e.gate) | bits(e.residual) | bits(e.y);
+  return (n_column | e.y_stride) % 4 == 0 && all % 16 == 0;
+}
+/// y of four adjacent sums from `column` on, with a gate if has_gate.
+template <bool kTogether>
+VLA_DEVICE void finish_four(const Epilogue& e, int row, int column, int n_column, const Four& sum, bool has_gate,
+                            const Four& gate) {
+  const int n = n_column - column;
+  const auto load = [&](const float* from, std::int64_t at, float otherwise) {
+    return from ? load_four(from + at, kTogether, n) : Four{{otherwise, otherwise, otherwise, otherwise}};
+  };
+  const Four bias = load(e.bias, column, kAddsNothing), factor = load(e.factor, column, kScalesNothing);
+  const Four residual = load(e.residual, static_cast<std::int64_t>(row) * n_column + column, kAddsNothing);
+  Four y;
+  const auto run = [&](auto activate) {
+#pragma unroll
+    for (int c = 0; c < 4; ++c)
+      y.of[c] = finish(e, has_gate, sum.of[c], bias.of[c], factor.of[c], gate.of[c], residual.of[c], activate);
+  };
+  with_activation(e.activation, run, run);
+  store_y(e, row, column, y, kTogether, n);
 }
 
 /// Stores y of two adjacent sums; the second may be after the last column.

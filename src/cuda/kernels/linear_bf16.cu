@@ -193,38 +193,29 @@ VLA_DEVICE Four add_shares(const LinearBf16Job& job, int row, int at, int n) {
   return sum;
 }
 
-/// y of four adjacent columns of a row.
 template <bool kTogether>
 VLA_DEVICE void finish_four(const LinearBf16Job& job, int row, int column) {
-  const Epilogue& e = job.end;
   const int n = job.n_column - column;
-  const auto load = [&](const float* from, std::int64_t at, float otherwise) {
-    return from ? load_four(from + at, kTogether, n) : Four{{otherwise, otherwise, otherwise, otherwise}};
+  const auto load = [&](const float* from, std::int64_t at) {
+    return from ? load_four(from + at, kTogether, n) : Four{};
   };
-  const std::int64_t at = static_cast<std::int64_t>(row) * job.n_column + column;
-  const Four bias = load(e.bias, column, kAddsNothing), factor = load(e.factor, column, kScalesNothing);
-  const Four gate_bias = load(job.gate_bias, column, kAddsNothing), residual = load(e.residual, at, kAddsNothing);
   const Four sum = add_shares<kTogether>(job, row, job.n_sum() - job.n_column + column, n);
-  const Four gate = job.gate_weight ? add_shares<kTogether>(job, row, column, n) : load(e.gate, at, 0);
-  Four y;
-  const auto run = [&](auto activate) {
+  Four gate = load(job.end.gate, static_cast<std::int64_t>(row) * job.n_column + column);
+  if (job.gate_weight) {
+    const Four bias = load(job.gate_bias, column);
+    gate = add_shares<kTogether>(job, row, column, n);
 #pragma unroll
-    for (int c = 0; c < 4; ++c)
-      y.of[c] = finish(e, job.gate_weight || e.gate, sum.of[c], bias.of[c], factor.of[c],
-                       dev::add(gate.of[c], gate_bias.of[c]), residual.of[c], activate);
-  };
-  with_activation(e.activation, run, run);
-  store_y(e, row, column, y, kTogether, n);
+    for (int c = 0; c < 4; ++c) gate.of[c] = dev::add(gate.of[c], bias.of[c]);
+  }
+  finish_four<kTogether>(job.end, row, column, job.n_column, sum, job.gate_weight || job.end.gate, gate);
 }
 
 /// Adds the partial sums of a split and computes y.
 VLA_DEVICE void finish_partial(const LinearBf16Job& job, int block) {
   const int row = static_cast<int>(blockIdx.y), column = (block * 128 + thread_index()) * 4;
   if (column >= job.n_column) return;
-  const Epilogue& e = job.end;
-  const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
-  const auto all = bits(e.bias) | bits(e.factor) | bits(e.gate) | bits(e.residual) | bits(e.y) | bits(job.gate_bias);
-  if ((job.n_column | e.y_stride) % 4 == 0 && (all | bits(job.partial)) % 16 == 0 && job.n_split <= kMostSplits)
+  const auto others = reinterpret_cast<std::uint64_t>(job.gate_bias) | reinterpret_cast<std::uint64_t>(job.partial);
+  if (is_of_fours(job.end, job.n_column) && others % 16 == 0 && job.n_split <= kMostSplits)
     finish_four<true>(job, row, column);
   else
     finish_four<false>(job, row, column);

@@ -218,20 +218,63 @@ VLA_EARLY_KERNEL(linear_int8_64, 128, 4, LinearInt8Job) { multiply<Bytes64>(job)
 VLA_KERNEL(linear_ternary_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::ternary>(job); }
 VLA_KERNEL(linear_int8_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::int8>(job); }
 
+namespace {
+
+/// Four adjacent sums of all shares of the depth, of which n are there. kTogether: all are there and aligned, and
+/// shares are kMostSplits at most, all of which are asked for at once.
+template <bool kTogether>
+VLA_DEVICE void add_shares(const LinearInt8Job& job, int row, int column, int n, int (&sum)[4]) {
+  const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * job.n_column;
+  const int* from = job.partial + static_cast<std::int64_t>(row) * job.n_column + column;
+  if constexpr (kTogether) {
+    uint4 share[kMostSplits];
+#pragma unroll
+    for (int z = 0; z < kMostSplits; ++z)
+      share[z] = z < job.n_split ? *reinterpret_cast<const uint4*>(from + z * apart) : uint4{0, 0, 0, 0};
+#pragma unroll
+    for (int z = 0; z < kMostSplits; ++z) {
+      const unsigned four[4] = {share[z].x, share[z].y, share[z].z, share[z].w};
+#pragma unroll
+      for (int c = 0; c < 4; ++c) sum[c] += static_cast<int>(four[c]);
+    }
+  } else {
+#pragma unroll 1
+    for (int z = 0; z < job.n_split; ++z, from += apart)
+#pragma unroll
+      for (int c = 0; c < 4; ++c)
+        if (c < n) sum[c] += from[c];
+  }
+}
+
+template <bool kTogether>
+VLA_DEVICE void finish_four(const LinearInt8Job& job, int row, int column) {
+  const int n = job.n_column - column;
+  int sum[4] = {};
+  add_shares<kTogether>(job, row, column, n, sum);
+  const Four scale = load_four(job.scale + column, kTogether, n);
+  bool are_plain = true;
+#pragma unroll
+  for (int c = 0; c < 4; ++c) are_plain = are_plain && (scale.of[c] == 0 || is_plain(scale.of[c]));
+  const RowRatios of(job, row, scale.of, are_plain);
+  Four scaled, gate = {};
+#pragma unroll
+  for (int c = 0; c < 4; ++c) scaled.of[c] = of.scaled(sum[c], c);
+  const std::int64_t at = static_cast<std::int64_t>(row) * job.n_column + column;
+  if (job.end.gate) gate = load_four(job.end.gate + at, kTogether, n);
+  finish_four<kTogether>(job.end, row, column, job.n_column, scaled, job.end.gate != nullptr, gate);
+}
+
+}  // namespace
+
 /// Adds the partial sums of a split and computes y.
 VLA_KERNEL(linear_int8_finish, 128, 4, LinearInt8Job) {
-  const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 2;
+  const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 4;
   if (column >= job.n_column) return;
-  const bool has_second = column + 1 < job.n_column;
-  int first = 0, second = 0;
-  for (int z = 0; z < job.n_split; ++z) {
-    const int* from = job.partial + (static_cast<std::int64_t>(z) * job.n_row + row) * job.n_column + column;
-    first += from[0];
-    if (has_second) second += from[1];
-  }
-  const RowScale of_row(job, row);
-  finish_pair(job.end, of_row.scaled(first, job.scale[column]),
-              has_second ? of_row.scaled(second, job.scale[column + 1]) : 0, row, column, job.n_column);
+  const auto others = reinterpret_cast<std::uint64_t>(job.scale) | reinterpret_cast<std::uint64_t>(job.partial);
+  if (is_of_fours(job.end, job.n_column) && others % 16 == 0 && job.n_split <= kMostSplits)
+    finish_four<true>(job, row, column);
+  else
+    finish_four<false>(job, row, column);
 }
 
 }  // namespace vla::cuda

@@ -100,7 +100,7 @@ inline Launch hopper_linear_int8(const HopperInt8Tile& tile, const LinearInt8Job
 }
 
 inline Launch finish_int8_partial(const LinearInt8Job& job) {
-  return {"linear_int8_finish", {blocks(job.n_column, 256), static_cast<unsigned>(job.n_row)}, 128};
+  return {"linear_int8_finish", {blocks(job.n_column, 512), static_cast<unsigned>(job.n_row)}, 128};
 }
 
 }  // namespace vla::cuda

@@ -24,8 +24,6 @@ VLA_DEVICE void store_pair(const LinearBf16Job& job, float first, float second, 
   store_partial(job, first, second, row, column, column + 1 < job.n_column);
 }
 
-constexpr int kMostSplits = 8;  // that are added at once
-
 /// Adds the gate's bias to two sums of it.
 VLA_DEVICE void add_gate_bias(const LinearBf16Job& job, PairEnds& ends, int column) {
   if (job.gate_bias == nullptr) return;
