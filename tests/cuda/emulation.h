@@ -114,7 +114,6 @@ namespace vla::cuda::dev {
 using test::cuda::commit_copies, test::cuda::shared_memory, test::cuda::shared_address, test::cuda::fence_async_proxy;
 inline void wait_for_earlier() {}
 inline void let_next_begin() {}
-inline void prefetch(const void*) {}
 template <class T>
 T read(const std::byte* p) {
   test::cuda::check_shared(p, sizeof(T), false);

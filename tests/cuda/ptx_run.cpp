@@ -440,7 +440,6 @@ const PtxOperation kOperations[] = {
     {"ex2.approx.f32", "dd", ONE(float, float, exp2f(a))},
     {"dp4a.s32.s32", "dddd", THREE(u32, u32, static_cast<u32>(vla::cuda::dev::dot4(a, b, static_cast<int>(c))))},
     {"cp.async.cg.shared.global", "sgdd", copy_async},
-    {"prefetch.global.L2", "g", [](WarpState&, const PtxInstruction&) {}},
     {"cp.async.commit_group", "",
      [](WarpState& w, const PtxInstruction&) { each_lane(w.active, [&](int l) { w.shared->commit(w.thread(l)); }); }},
     {"cp.async.wait_group", "d",

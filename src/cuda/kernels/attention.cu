@@ -166,23 +166,6 @@ class Reader {
   int segment_ = 0, begin_ = 0, end_ = 0;
 };
 
-/// Has the first two tiles of a block's keys and values brought to the L2 cache. Those of earlier kernels, which a step
-/// of a large network has pushed out since the step before, come while the kernel before this one ends.
-template <class S>
-VLA_DEVICE void prefetch_keys(const AttentionJob& job, const Unit& unit, const Share& share) {
-  constexpr int kLine = 64, kLines = (S::kDepth + kLine - 1) / kLine;  // elements of a line, and lines of a row
-  const int column = thread_index() % kLines * kLine, most = share.first + 2 * S::kKeys;
-  const int last = share.last < most ? share.last : most;
-  int segment = 0, begin = 0;
-  for (int key = share.first + thread_index() / kLines; key < last; key += S::kThreads / kLines) {
-    while (key - begin >= job.segment[segment].n_key) begin += job.segment[segment++].n_key;
-    const AttentionJob::Segment& of = job.segment[segment];
-    if (column >= job.d_head) continue;
-    dev::prefetch(row_of<std::uint16_t>(of.k, unit.head_kv, key - begin, unit.batch) + column);
-    dev::prefetch(row_of<std::uint16_t>(of.v, unit.head_kv, key - begin, unit.batch) + column);
-  }
-}
-
 /// Copies a block's rows of queries, and zeros behind the last.
 template <class S>
 VLA_DEVICE void fetch_queries(const AttentionJob& job, const Unit& unit, int row0, std::byte* to) {
@@ -480,7 +463,6 @@ VLA_DEVICE void attend_shared(const AttentionJob& job) {
   const Share share(job);
   Reader<S, &AttentionJob::Segment::k> keys(job, unit);
   Reader<S, &AttentionJob::Segment::v> values(job, unit);
-  prefetch_keys<S>(job, unit, share);
   dev::wait_for_earlier();
   clear_columns<S>(job.d_head, S::kRows + 2 * S::kKeys, q);
   fetch_queries<S>(job, unit, static_cast<int>(blockIdx.x) * S::kRows, q);

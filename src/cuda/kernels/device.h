@@ -104,9 +104,6 @@ VLA_DEVICE void multiply_bf16(float (&sum)[4], const unsigned (&a)[4], unsigned 
 /// sum + the dot product of the four signed bytes of a and b.
 VLA_DEVICE int dot4(unsigned a, unsigned b, int sum) { return __dp4a(static_cast<int>(a), static_cast<int>(b), sum); }
 
-/// Has the cache line at an address brought to the L2 cache; no access to what is there.
-VLA_DEVICE void prefetch(const void* p) { asm volatile("prefetch.global.L2 [%0];" ::"l"(p)); }
-
 /// The value of the lane whose index differs in the bits of `mask`.
 template <class T>
 VLA_DEVICE T shuffle_xor(T value, int mask) {
