@@ -542,9 +542,9 @@ MISTAKES |= {
     "halves of eight elements change places": ("linear_strip.cu", "linear_strip", "first[4] = {low.x, high.x, low.y, high.y}", "first[4] = {low.z, high.x, low.y, high.y}"),
     "the gate's bias is left out": ("share.h", "linear_strip", "if (job.gate_bias == nullptr) return;", "return;"),
     "shares of the gate lie where those of the product do": ("linear_strip.cu", "linear_strip", "job.n_sum() - job.n_column + column, has_second", "column, has_second"),
-    "a job's blocks begin one too late": ("device.h", "linear_strip", "blockIdx.x >= jobs.end[i]", "blockIdx.x > jobs.end[i]"),
+    "a job's blocks begin one too late": ("device.h", "linear_strip", "block >= jobs.end[i]", "block > jobs.end[i]"),
     # Rows in registers.
-    "zeros behind a row's end count as values": ("rows.cu", "rows", "squares += place(j) + k < n ?", "squares += true ?"),
+    "zeros behind a row's end count as values": ("rows.cu", "rows", "squares += place(j) < n ?", "squares += true ?"),
     "NaN keeps the device's bits": ("rows.cu", "rows", "rounded == rounded ?", "true ?"),
     "a long row is looked up from its beginning only": ("rows.cu", "rows", "static_cast<int>(blockIdx.y) * kLookupBlock", "0"),
 }

@@ -50,10 +50,10 @@ struct CudaOp : Step {
   AttentionPlan plan = {};  // of an AttentionOp
   ValueId gate = kNone;     // the gate product's result, if no kernel computes gate and up together
   ValueId partial = kNone;  // partial results of the shares of the depth or of the keys
-  /// Of a norm: the product whose shares of the depth it adds first, which therefore leaves them.
-  std::shared_ptr<const CudaOp> finishes = nullptr;
-  bool leaves_shares = false;
+  std::shared_ptr<const CudaOp> finishes = nullptr;  // of a norm: the product whose shares of the depth it adds first
 };
+/// Whether another operation adds a product's shares of the depth.
+inline bool leaves_shares(const CudaOp& op) { return op.partial != kNone && op.writes[0] == op.partial; }
 
 struct CudaLowering : Lowering {
   const CudaWeights& weights;

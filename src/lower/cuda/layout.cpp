@@ -180,7 +180,7 @@ class CudaLayouts final : Layouts {
     };
     if (std::any_of(l.ops.begin(), l.ops.end(), reads_first)) return;
     norm.finishes = std::make_shared<const CudaOp>(*maker);
-    maker->writes = {maker->partial}, maker->leaves_shares = true;
+    maker->writes = {maker->partial};
     std::replace(norm.reads.begin(), norm.reads.end(), what.x, maker->partial);
     const auto& product = std::get<LinearOp>(maker->op);
     for (const ValueId id : {product.factor, product.residual})
@@ -191,7 +191,7 @@ class CudaLayouts final : Layouts {
   /// lacks.
   bool leaves_plain_shares(const CudaOp& op) const {
     const auto* product = std::get_if<LinearOp>(&op.op);
-    return product != nullptr && product->linears.size() == 1 && op.partial != kNone && !op.leaves_shares &&
+    return product != nullptr && product->linears.size() == 1 && op.partial != kNone && !leaves_shares(op) &&
            op.cut.n_split <= cuda::kMostFinishedSplits && l.matrix(*product->linears[0]).kind == MatrixKind::bf16 &&
            l.value(op.writes[0]).type == DType::f32 && product->activation == Activation::none &&
            !product->ends_in_relu;

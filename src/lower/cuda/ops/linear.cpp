@@ -69,7 +69,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
       calls.push_back(call(shape == ProductShape::hopper ? cuda::hopper_linear_bf16(cuda::kHopperTiles[tile], job)
                                                          : cuda::linear_bf16(bf16_shape(shape), job),
                            job));
-      if (job.n_split > 1 && !op.leaves_shares) calls.push_back(call(cuda::finish_bf16_partial(job), job));
+      if (job.n_split > 1 && !leaves_shares(op)) calls.push_back(call(cuda::finish_bf16_partial(job), job));
       return;
     }
     case MatrixKind::ternary:
