@@ -6,8 +6,8 @@
 
 #include <cmath>
 #include <fstream>
-#include <sstream>
 
+#include "base/process.h"
 #include "devices/devices.h"
 #include "engine/description.h"
 #include "kernels/kernel_set.h"
@@ -17,16 +17,11 @@ namespace {
 
 constexpr double kFewMs = 250;  // a shorter act may be faster on one thread
 
-std::string content(const char* path) {
-  std::ifstream in(path);
-  std::ostringstream text;
-  text << in.rdbuf();
-  return text.str();
-}
-
 std::string first_line(const char* path) {
-  const std::string text = content(path);
-  return text.substr(0, text.find('\n'));
+  std::ifstream in(path);
+  std::string line;
+  std::getline(in, line);
+  return line;
 }
 
 double median_cores(const Report& report) {
@@ -61,21 +56,6 @@ double predict_int8(const Request& request) {
 }
 
 }  // namespace
-
-std::size_t free_memory(const std::string& meminfo, const std::string& limit, const std::string& used) {
-  const std::string key = "MemAvailable:";
-  const std::size_t at = meminfo.find(key);
-  const auto number = [](const char* text) { return static_cast<std::size_t>(std::strtoull(text, nullptr, 10)); };
-  const std::size_t system = at == std::string::npos ? 0 : 1024 * number(meminfo.c_str() + at + key.size());
-  if (limit.empty() || used.empty() || limit.starts_with("max")) return system;
-  const std::size_t most = number(limit.c_str()), now = number(used.c_str());
-  return std::min(system, most - std::min(most, now));
-}
-
-std::size_t free_memory() {
-  return free_memory(content("/proc/meminfo"), content("/sys/fs/cgroup/memory.max"),
-                     content("/sys/fs/cgroup/memory.current"));
-}
 
 Result<Machine> examine_machine() {
   VLA_TRY(const std::unique_ptr<Device> device, open_device(0, ""));

@@ -20,11 +20,6 @@ struct Machine {
 /// Measures for a second or two; the machine should be idle. Errors: device.
 Result<Machine> examine_machine();
 
-/// Bytes that a process may allocate: the system's available memory, or less under a control group's limit. `meminfo`,
-/// `limit` and `used` are the contents of /proc/meminfo and of the group's two files; empty if missing.
-std::size_t free_memory(const std::string& meminfo, const std::string& limit, const std::string& used);
-std::size_t free_memory();  // of this machine now
-
 /// A stage of the network: predicted and measured.
 struct StageCheck {
   std::string name;

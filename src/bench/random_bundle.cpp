@@ -13,7 +13,7 @@
 #include <optional>
 
 #include "base/file.h"
-#include "bench/doctor.h"
+#include "base/process.h"
 #include "bundle/gguf_writer.h"
 #include "policies/policy.h"
 

@@ -232,15 +232,6 @@ TEST_CASE("a policy that takes one camera's frames alone, and one whose prompt t
   }
 }
 
-TEST_CASE("memory that a process could take is what the system and its group leave") {
-  const std::string meminfo = "MemTotal:  8000 kB\nMemAvailable:    2000 kB\n";
-  CHECK(free_memory(meminfo, "", "") == 2'048'000);
-  CHECK(free_memory(meminfo, "max\n", "12\n") == 2'048'000);
-  CHECK(free_memory(meminfo, "1000000\n", "400000\n") == 600'000);
-  CHECK(free_memory(meminfo, "1000000\n", "1400000\n") == 0);
-  CHECK(free_memory("", "", "") == 0);
-}
-
 TEST_CASE("a rate is held while a chunk lasts until the next one is there") {
   Checkup checkup;
   checkup.horizon = 16, checkup.rate_hz = 80, checkup.total = 190;
