@@ -29,9 +29,9 @@ MAIN_LOOPS = {
     "attention_bf16_256": ("HMMA.16816.F32.BF16", 64),
     "attention_bf16_256_32": ("HMMA.16816.F32.BF16", 64),
 }
-# Strips: three steps of 64 rows and 16 or 32 columns.
+# Strips: two or three steps of 64 rows and 16 or 32 columns.
 STRIP_LOOPS = {
-    name: ("HMMA.16816.F32.BF16", 48 if "_16" in name else 96)
+    name: ("HMMA.16816.F32.BF16", 48 if "_16" in name else 96 if "_32_gated" in name else 64)
     for width in (16, 32, 64, 128)
     for name in (f"linear_strip_{width}", f"linear_strip_{width}_gated", *([f"linear_strips_{width}"] if width < 128 else []))
 }

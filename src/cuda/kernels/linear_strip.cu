@@ -6,7 +6,6 @@ namespace vla::cuda {
 namespace {
 
 constexpr int kWarps = 8, kThreads = kWarps * kLanes, kStripRows = 64, kTilesM = kStripRows / 16;
-constexpr int kAhead = 3;  // steps of a warp that are under way: all of a depth of 768
 
 /// A block has kColumns columns of sums of up to 64 rows, half of them the gate's where there is one. Its warps have
 /// kTilesN * 8 of the columns each, and take the depth's steps in turn with those that have the same columns.
@@ -16,6 +15,8 @@ struct Strip {
   static constexpr bool kGated = kGated_;
   static constexpr int kColumns = kTilesN * 8 * kWarpsN;
   static constexpr int kColumnsY = kGated ? kColumns / 2 : kColumns;
+  // Steps of a warp that are under way: all of a depth of 768 where registers do for them.
+  static constexpr int kAhead = kTilesN == 2 || (kGated && kWarpsN == 1) ? 3 : 2;
   static constexpr int kRowBytes = (kColumns + 8) * 4;  // of sums in shared memory, padded against bank conflicts
 };
 
@@ -132,19 +133,19 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job, int block) {
   const Share share(job);
   const Operands<S> operands(job, row0, column0, of_warp);
 
-  typename Operands<S>::Step ahead[kAhead];
+  typename Operands<S>::Step ahead[S::kAhead];
   const int first = share.first + of_k;
 #pragma unroll
-  for (int i = 0; i < kAhead; ++i) operands.load_weight(ahead[i], first + i * S::kWarpsK);
+  for (int i = 0; i < S::kAhead; ++i) operands.load_weight(ahead[i], first + i * S::kWarpsK);
   dev::wait_for_earlier();
 #pragma unroll
-  for (int i = 0; i < kAhead; ++i) operands.load_x(ahead[i], first + i * S::kWarpsK);
+  for (int i = 0; i < S::kAhead; ++i) operands.load_x(ahead[i], first + i * S::kWarpsK);
   float sum[kTilesM][S::kTilesN][4] = {};
 #pragma unroll 1
-  for (int step = first; step < share.end; step += kAhead * S::kWarpsK) {
+  for (int step = first; step < share.end; step += S::kAhead * S::kWarpsK) {
 #pragma unroll
-    for (int i = 0; i < kAhead; ++i) {
-      const int now = step + i * S::kWarpsK, next = now + kAhead * S::kWarpsK;
+    for (int i = 0; i < S::kAhead; ++i) {
+      const int now = step + i * S::kWarpsK, next = now + S::kAhead * S::kWarpsK;
       if (now < share.end) ahead[i].multiply(sum);
       if (next < share.end) operands.load_weight(ahead[i], next), operands.load_x(ahead[i], next);
     }
