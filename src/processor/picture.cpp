@@ -11,18 +11,10 @@ namespace {
 
 constexpr std::size_t kChannels = 3;
 
-/// Applies the ops after the fit, which change each element of a plane separately.
-void apply_ops(const Recipe& recipe, int view, std::span<float> planes) {
-  for (const auto& op : recipe.image)
-    if (op->view() == PlaneOp::kEveryView || op->view() == view)
-      for (std::size_t c = 0; c < kChannels; ++c)
-        op->apply(planes.subspan(c * planes.size() / kChannels, planes.size() / kChannels), c);
-}
-
 /// What the ops make of black, then of white, per channel.
 std::array<float, 2 * kChannels> ends_of(const Recipe& recipe, int view) {
   std::array<float, 2 * kChannels> ends = {0, 1, 0, 1, 0, 1};
-  apply_ops(recipe, view, ends);
+  apply_ops(recipe, view, ends, 0, 2);
   return ends;
 }
 
@@ -41,7 +33,7 @@ Result<Frame> picture_of(const Processor& processor, const Frame& frame, int vie
   std::vector<float> planes(kChannels * n_pixel);
   VLA_CHECK(check_frame(frame, name));
   VLA_CHECK(recipe.fit->apply(frame, view, planes, name));
-  apply_ops(recipe, view, planes);
+  apply_ops(recipe, view, planes, 0, n_pixel);
   const std::array<float, 2 * kChannels> ends = ends_of(recipe, view);
   std::vector<std::uint8_t> rgb(planes.size());
   for (std::size_t c = 0; c < kChannels; ++c)

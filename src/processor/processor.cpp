@@ -141,12 +141,8 @@ Status Processor::encode_rows(const Frame& frame, const std::string& name, int v
   VLA_CHECK(recipe_.fit->makes_rows() ? recipe_.fit->apply_rows(frame, rows, out, name)
                                       : recipe_.fit->apply(frame, view, out, name));
   const auto width = static_cast<std::size_t>(recipe_.width);
-  for (const auto& op : recipe_.image)
-    if (op->view() == PlaneOp::kEveryView || op->view() == view)
-      for (std::size_t c = 0; c < 3; ++c)
-        op->apply(out.subspan(c * out.size() / 3 + static_cast<std::size_t>(rows.first) * width,
-                              static_cast<std::size_t>(rows.end - rows.first) * width),
-                  c);
+  apply_ops(recipe_, view, out, static_cast<std::size_t>(rows.first) * width,
+            static_cast<std::size_t>(rows.end - rows.first) * width);
   return {};
 } catch (const std::bad_alloc&) {
   return Error{Code::out_of_memory, "act", "", "no memory left", "free memory"};

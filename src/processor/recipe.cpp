@@ -115,4 +115,12 @@ Result<Recipe> parse_recipe(const std::string& json) {
   return recipe;
 }
 
+void apply_ops(const Recipe& recipe, int view, std::span<float> planes, std::size_t first, std::size_t n) {
+  constexpr std::size_t kChannels = 3;
+  for (const auto& op : recipe.image)
+    if (op->view() == PlaneOp::kEveryView || op->view() == view)
+      for (std::size_t c = 0; c < kChannels; ++c)
+        op->apply(planes.subspan(c * planes.size() / kChannels + first, n), c);
+}
+
 }  // namespace vla

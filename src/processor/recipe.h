@@ -42,4 +42,8 @@ struct Recipe {
 /// define.
 Result<Recipe> parse_recipe(const std::string& json);
 
+/// Applies the ops of `recipe.image` that are for a view, or for PlaneOp::kEveryView those for all, to values `first`
+/// to first + n - 1 of each of the three channels of `planes`, each of which they change alone.
+void apply_ops(const Recipe& recipe, int view, std::span<float> planes, std::size_t first, std::size_t n);
+
 }  // namespace vla
