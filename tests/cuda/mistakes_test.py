@@ -497,8 +497,8 @@ MISTAKES = {
     "a norm leaves out the last share": (
         "rows.cu",
         "rows",
-        "z < kMostFinishedSplits; ++z) sum +=",
-        "z + 1 < kMostFinishedSplits; ++z) sum +=",
+        "z < kMostSplits; ++z) sum +=",
+        "z + 1 < kMostSplits; ++z) sum +=",
     ),
     "a warp norms a row behind the last": ("rows.cu", "rows", "if (row >= job.n_row) return;  // the whole warp", ""),
     "a wide row is kept all the same": ("rows.cu", "rows", "const bool is_kept = n <= kMaxKept;", "const bool is_kept = true;"),

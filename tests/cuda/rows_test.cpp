@@ -92,7 +92,7 @@ TEST_CASE("norms of a sum are within 2e-6 of doubles, and the sum is what was ad
 
 TEST_CASE("a norm adds the shares of a product as the kernel that does nothing else") {
   for (const int n : {720, 1024, 2048})
-    for (const int n_split : {2, kMostFinishedSplits})
+    for (const int n_split : {2, kMostSplits})
       for (const bool has_all : {false, true}) {
         INFO(n, " columns, ", n_split, " shares");
         Numbers numbers;

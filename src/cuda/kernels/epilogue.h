@@ -7,6 +7,8 @@
 
 namespace vla::cuda {
 
+constexpr int kMostSplits = 8;  // shares of the depth that a kernel adds at once
+
 /// What follows a product's sums: y = activation(sum + bias) * factor + residual, or the ReLU of that; with a gate y =
 /// activation(gate) * (sum + bias) * factor + residual. All operands except y may be null.
 struct Epilogue {

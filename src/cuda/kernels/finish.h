@@ -7,8 +7,6 @@
 
 namespace vla::cuda {
 
-constexpr int kMostSplits = 8;  // shares of the depth that are added at once
-
 /// Operands that change nothing, in the place of those that an epilogue lacks: x + -0 is x, for zeros of both signs
 /// too.
 constexpr float kAddsNothing = -0.0f, kScalesNothing = 1;
@@ -37,8 +35,8 @@ VLA_DEVICE float activate(Activation activation, float x) {
   return is_sigmoid(activation) ? activate_by_sigmoid(activation, x) : activate_otherwise(activation, x);
 }
 
-/// Calls run(activate), with code of its own for the activations of most networks, or otherwise(activate). An
-/// instruction that a value skips still comes to the cache, past which it takes longer than the value.
+/// Calls run(activate) for the activations of most networks, compiled for each of them, or otherwise(activate).
+/// Skipped instructions still pass through the instruction cache, and fetching them costs more than a value's work.
 template <class Run, class Otherwise>
 VLA_DEVICE void with_activation(Activation activation, Run run, Otherwise otherwise) {
   if (activation == Activation::none)

@@ -114,8 +114,7 @@ class TileEnd {
         }
       }
   }
-  /// The same for one activation. Loads of kRowsAhead rows are under way at a time, and their values side by side: each
-  /// activation has code of its own, as instructions of a row that are not in the cache take longer than the row.
+  /// The same for one activation. Loads of kRowsAhead rows are under way at a time.
   template <int kRowsAhead, bool kTogether, class OfRow, class Value, class Activate>
   VLA_DEVICE void finish_rows(const std::byte* sums, OfRow of_row, Value value, Activate activate) const {
     const auto load = [&](const float* from, std::int64_t at, float otherwise) {

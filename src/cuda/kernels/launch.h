@@ -43,6 +43,14 @@ struct Several {
   int n;
 };
 
+/// Writes where the blocks of each job end, n_block(job) for each. Returns the number of all.
+template <class Job, int kMost, class Count>
+unsigned fill_ends(Several<Job, kMost>& jobs, Count n_block) {
+  unsigned end = 0;
+  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = end += n_block(jobs.job[i]);
+  return end;
+}
+
 constexpr unsigned blocks(std::int64_t n, std::int64_t size) { return static_cast<unsigned>((n + size - 1) / size); }
 constexpr std::int64_t round_up(std::int64_t n, std::int64_t unit) { return (n + unit - 1) / unit * unit; }
 

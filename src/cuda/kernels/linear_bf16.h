@@ -63,11 +63,9 @@ inline Launch linear_strip(unsigned width, const LinearBf16Job& job) {
 }
 /// Several products in strips of the same width, rows and depth, without gates and splits.
 inline Launch linear_strips(unsigned width, Several<LinearBf16Job>& jobs) {
-  unsigned n_block = 0;
-  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = n_block += blocks(jobs.job[i].n_column, width);
   Launch launch = linear_strip(width, jobs.job[0]);
   launch.kernel = width == 16 ? "linear_strips_16" : width == 32 ? "linear_strips_32" : "linear_strips_64";
-  launch.grid.x = n_block;
+  launch.grid.x = fill_ends(jobs, [&](const LinearBf16Job& one) { return blocks(one.n_column, width); });
   return launch;
 }
 
@@ -131,9 +129,8 @@ inline Launch hopper_linear_bf16(const HopperTile& tile, const LinearBf16Job& jo
 /// Several products of the same rows, depth and number of shares, without gates.
 inline Launch hopper_linears_bf16(const HopperTile& tile, Several<LinearBf16Job>& jobs) {
   Launch launch = hopper_linear_bf16(tile, jobs.job[0]);
-  unsigned n_block = 0;
-  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = n_block += blocks(jobs.job[i].n_column, tile.columns);
-  launch.kernel = tile.several, launch.grid.y = n_block;
+  launch.kernel = tile.several;
+  launch.grid.y = fill_ends(jobs, [&](const LinearBf16Job& one) { return blocks(one.n_column, tile.columns); });
   return launch;
 }
 
@@ -141,8 +138,7 @@ inline Launch finish_bf16_partial(const LinearBf16Job& job) {
   return {"linear_bf16_finish", {blocks(job.n_column, 512), static_cast<unsigned>(job.n_row)}, 128};
 }
 inline Launch finish_bf16_partials(Several<LinearBf16Job>& jobs) {
-  unsigned n_block = 0;
-  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = n_block += finish_bf16_partial(jobs.job[i]).grid.x;
+  const unsigned n_block = fill_ends(jobs, [](const LinearBf16Job& one) { return finish_bf16_partial(one).grid.x; });
   return {"linear_bf16_finishes", {n_block, static_cast<unsigned>(jobs.job[0].n_row)}, 128};
 }
 

@@ -35,9 +35,7 @@ inline Launch map_elements(const MapJob& job) { return {"map_elements", {blocks(
 /// Parts of one result, in one launch.
 using MapJobs = Several<MapJob, 16>;
 inline Launch map_parts(MapJobs& jobs) {
-  unsigned n_block = 0;
-  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = n_block += map_elements(jobs.job[i]).grid.x;
-  return {"map_parts", {n_block}, 256};
+  return {"map_parts", {fill_ends(jobs, [](const MapJob& one) { return map_elements(one).grid.x; })}, 256};
 }
 
 }  // namespace vla::cuda

@@ -101,7 +101,8 @@ VLA_DEVICE void store_codes(std::byte* y, int n, const float (&x)[kGroups][4]) {
   store_scale(y + depth, s, reduce(sum_of_warp(sum), 3, sum_of));
 }
 
-/// What a row's norm is of, in fours: loads all of them before it computes any. x + residual:
+/// The input of a row's norm, four values at a time: every load is issued before the first value is computed. Here x +
+/// residual.
 template <int kGroups>
 class Added {
  public:
@@ -114,7 +115,7 @@ class Added {
  private:
   float x_[kGroups][4], residual_[kGroups][4];
 };
-/// A product of shares of its depth:
+/// Here a product, from the shares of its depth.
 template <int kGroups>
 class Finished {
  public:
@@ -122,7 +123,7 @@ class Finished {
     const int n = job.n_column;
     const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * n;
 #pragma unroll
-    for (int z = 0; z < kMostFinishedSplits; ++z)
+    for (int z = 0; z < kMostSplits; ++z)
       load_four(share_[j][z], z < job.n_split ? job.partial + z * apart + row * n : nullptr, i, n, 0);
     load_four(bias_[j], job.end.bias, i, n, kAddsNothing);
     load_four(factor_[j], job.end.factor, i, n, kScalesNothing);
@@ -131,12 +132,12 @@ class Finished {
   VLA_DEVICE float value(int j, int k) const {
     float sum = 0;
 #pragma unroll
-    for (int z = 0; z < kMostFinishedSplits; ++z) sum += share_[j][z][k];
+    for (int z = 0; z < kMostSplits; ++z) sum += share_[j][z][k];
     return dev::add(dev::multiply(dev::add(sum, bias_[j][k]), factor_[j][k]), residual_[j][k]);
   }
 
  private:
-  float share_[kGroups][kMostFinishedSplits][4], bias_[kGroups][4], factor_[kGroups][4], residual_[kGroups][4];
+  float share_[kGroups][kMostSplits][4], bias_[kGroups][4], factor_[kGroups][4], residual_[kGroups][4];
 };
 
 /// Writes four adjacent values of a normalized row.

@@ -25,7 +25,7 @@ struct NormJob {
   RowType type;
 };
 constexpr int kMaxKept = 24576;  // wider rows are read again; narrower ones stay in shared memory
-/// Many rows have a warp each, which has no barrier to wait at.
+/// From kManyRows rows on, of up to kOfWarp values, each warp norms a row without block barriers.
 constexpr int kManyRows = 1024, kOfWarp = 1024, kRowsOfBlock = 4;
 inline bool is_aligned(const void* p) { return reinterpret_cast<std::uint64_t>(p) % 16 == 0; }
 /// Whether rows consist of aligned fours.
@@ -45,14 +45,14 @@ inline Launch norm_rows(const NormJob& job) {
   return {job.n <= 2048 ? "norm_rows_2" : "norm_rows_4", {n_row}, 256, 256};
 }
 
-/// y = norm(v) for the v of a product whose depth is split into up to kMostFinishedSplits, of up to kMostFinished
-/// columns: adds the shares as finish_bf16_partial does, without an activation, a gate and a last ReLU. v goes to
-/// norm.sum. Rows consist of aligned fours.
+/// y = norm(v) for the v of a product whose depth is split into up to kMostSplits, of up to kMostFinished columns: adds
+/// the shares as finish_bf16_partial does, without an activation, a gate and a last ReLU. v goes to norm.sum. Rows
+/// consist of aligned fours.
 struct FinishNormJob {
   LinearBf16Job product;
   NormJob norm;  // without x and residual
 };
-constexpr int kMostFinished = 2048, kMostFinishedSplits = 8;
+constexpr int kMostFinished = 2048;
 inline bool is_whole(const FinishNormJob& job) {
   const Epilogue& end = job.product.end;
   return is_whole(job.norm) && is_aligned(job.product.partial) && is_aligned(end.bias) && is_aligned(end.factor) &&
@@ -83,9 +83,7 @@ inline Launch head_rows(const HeadJob& job) {
 }
 
 inline Launch several_head_rows(Several<HeadJob>& jobs) {
-  unsigned n_block = 0;
-  for (int i = 0; i < jobs.n; ++i) jobs.end[i] = n_block += head_rows(jobs.job[i]).grid.x;
-  return {"several_head_rows", {n_block}, 128};
+  return {"several_head_rows", {fill_ends(jobs, [](const HeadJob& one) { return head_rows(one).grid.x; })}, 128};
 }
 
 enum class TableType { f32, f16, bf16 };

@@ -16,7 +16,7 @@ struct Rates {
   double of_sm;          // bytes that an SM reads from the L2 cache
   double least;          // least time of a step of the depth
   double kernel, block;  // fixed costs of the kernel and of a block
-  double first_end;      // of a block that ends in results: instructions that no block before has read
+  double first_end;      // once for blocks that end in results: fetching the epilogue's instructions
   double end, share;     // per result of a block, and per sum of a share of the depth
   double further;        // the fraction of a block's time that each further block on an SM adds
 };
