@@ -76,7 +76,7 @@ def copy_tiny(vla, kit):
     shutil.copy(frame, kit / "tiny/frame.png")
     asked = lambda image: ["--image", f"corner4={image}", "--state", "0.0045,0.4003,0.1957,1", "--text", "open the faucet", "--seed", "1", "--json"]  # noqa: E731
     answer = lambda kernels: json.loads(run(vla, "run", TINY, *asked(frame), "--kernels", kernels).splitlines()[-1])["actions"]  # noqa: E731
-    answers = {"float32": answer("float32"), "int8": answer("int8")}
+    answers = {kernels: answer(kernels) for kernels in ("float32", "int8", "int4")}
     answers["bf16"] = answers["float32"]  # not every CPU multiplies bf16
     (kit / "tiny/act.json").write_text(json.dumps({"arguments": asked("tiny/frame.png"), "answers": answers}))
 

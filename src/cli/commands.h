@@ -18,7 +18,7 @@ constexpr const char* kKernelsHelp =
     "not given: on the CPU the best for the bundle's dtype, which multiplies bf16 (by neon_bf16, avx512_bf16 or amx) "
     "if the "
     "bundle is stored as bf16. On Vulkan float32 (not given) or bf16; on CUDA as stored (not given), float32, bf16, "
-    "int8, or ggml for its backend";
+    "int8, int4, or ggml for its backend";
 
 /// Help of --device, wherever a policy is loaded.
 constexpr const char* kDeviceHelp =

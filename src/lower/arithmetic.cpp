@@ -58,9 +58,10 @@ Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::
   if (kernels == kFloat32) return Arithmetic{best, {}, has_own ? Rounding::float32 : Rounding::none};
   if (kernels == kBf16) return Arithmetic{best, {}, Rounding::bf16};
   if (kernels == kInt8 && has_own) return Arithmetic{best, {}, Rounding::int8};
+  if (kernels == kInt4 && has_own) return Arithmetic{best, {}, Rounding::int4};
   return Error{Code::usage, "kernels",
-               fmt::format("none, float32, bf16{} or ggml with device {}", has_own ? ", int8" : "", device), kernels,
-               "other kernels are the CPU's"};
+               fmt::format("none, float32, bf16{} or ggml with device {}", has_own ? ", int8, int4" : "", device),
+               kernels, "other kernels are the CPU's"};
 }
 
 }  // namespace vla

@@ -10,6 +10,7 @@
 #include <random>
 #include <type_traits>
 
+#include "bundle/encoding.h"
 #include "cuda/machine.h"
 
 using namespace vla;
@@ -35,7 +36,8 @@ constexpr Case kHopperCases[] = {
 class Trial {
  public:
   Trial(CodeKind kind, const Case& c) : kind_(kind), c_(c) {
-    std::uniform_int_distribution<int> code(kind == CodeKind::ternary ? -1 : -127, kind == CodeKind::ternary ? 1 : 127);
+    const int most = kind == CodeKind::ternary ? 1 : kind == CodeKind::int4 ? Int4Block::kMost : 127;
+    std::uniform_int_distribution<int> code(-most, most), step(0, Int4Block::kMaxStep);
     std::uniform_int_distribution<int> any(-127, 127);
     std::uniform_real_distribution<float> real(-2, 2);
     const auto fill = [&](std::size_t n) {
@@ -51,6 +53,8 @@ class Trial {
     for (std::size_t n = 4; n < scale_.size(); n += 13) scale_[n] = n % 2 == 0 ? 3e-39f : 0;
     weight_.resize(size(c.d_out, c.d_in));
     for (auto& v : weight_) v = static_cast<std::int8_t>(code(random_));
+    steps_.assign(size(c.d_out, Int4Block::n_of(c.d_in)), 1);
+    for (int& v : steps_) v = kind == CodeKind::int4 ? step(random_) : 1;
     x_.resize(size(c.n_row, depth() + 64));
     for (int r = 0; r < c.n_row; ++r) {
       int sum = 0;
@@ -97,16 +101,15 @@ class Trial {
     return y.host();
   }
 
-  /// The matrix as a bundle has it: int8, or two bits, in rows of whole bytes.
+  /// The matrix as a bundle has it: int8, two bits in rows of whole bytes, or blocks of four bits.
   std::vector<std::byte> stored() const {
+    if (kind_ == CodeKind::int4) return stored_blocks();
     const std::int64_t per_byte = kind_ == CodeKind::ternary ? 4 : 1, row = (c_.d_in + per_byte - 1) / per_byte;
     std::vector<std::byte> bytes(size(c_.d_out, row));
     for (std::int64_t n = 0; n < c_.d_out; ++n)
-      for (std::int64_t k = 0; k < c_.d_in; ++k) {
-        const int code = weight_[size(n, c_.d_in) + static_cast<std::size_t>(k)];
+      for (std::int64_t k = 0; k < c_.d_in; ++k)
         bytes[size(n, row) + static_cast<std::size_t>(k / per_byte)] |=
-            static_cast<std::byte>(kind_ == CodeKind::ternary ? (code + 1) << 2 * (k % 4) : code);
-      }
+            static_cast<std::byte>(kind_ == CodeKind::ternary ? (code(n, k) + 1) << 2 * (k % 4) : code(n, k));
     return bytes;
   }
 
@@ -117,8 +120,7 @@ class Trial {
       for (int n = 0; n < c_.d_out; ++n) {
         int sum = 0;
         for (int k = 0; k < c_.d_in; ++k)
-          sum += codes_[size(r, depth()) + static_cast<std::size_t>(k)] *
-                 weight_[size(n, c_.d_in) + static_cast<std::size_t>(k)];
+          sum += codes_[size(r, depth()) + static_cast<std::size_t>(k)] * code(n, k) * step(n, k);
         const float step = scale_[static_cast<std::size_t>(n)] / row_scale_[static_cast<std::size_t>(r)];
         float value = static_cast<float>(sum) * step;
         if (c_.has_bias) value += bias_[static_cast<std::size_t>(n)];
@@ -130,12 +132,29 @@ class Trial {
 
  private:
   static std::size_t size(std::int64_t rows, std::int64_t columns) { return static_cast<std::size_t>(rows * columns); }
+  int code(std::int64_t n, std::int64_t k) const { return weight_[size(n, c_.d_in) + static_cast<std::size_t>(k)]; }
+  int step(std::int64_t n, std::int64_t k) const {
+    return steps_[size(n, Int4Block::n_of(c_.d_in)) + static_cast<std::size_t>(k / 64)];
+  }
+  std::vector<std::byte> stored_blocks() const {
+    std::vector<std::byte> bytes(steps_.size() * sizeof(Int4Block));
+    auto* block = reinterpret_cast<Int4Block*>(bytes.data());
+    for (std::int64_t n = 0; n < c_.d_out; ++n)
+      for (std::int64_t first = 0; first < c_.d_in; first += Int4Block::kElements, ++block) {
+        block->step = static_cast<std::uint8_t>(step(n, first));
+        for (std::int64_t k = first; k < std::min<std::int64_t>(first + Int4Block::kElements, c_.d_in); ++k)
+          block->codes[static_cast<std::size_t>((k - first) / 2)] |=
+              static_cast<std::uint8_t>(code(n, k) + Int4Block::kZero) << k % 2 * 4;
+      }
+    return bytes;
+  }
   int depth() const { return static_cast<int>(round_up(c_.d_in, Int8Tile::kDepth)); }
 
   std::mt19937 random_{3};
   CodeKind kind_;
   Case c_;
   std::vector<std::int8_t> codes_, weight_;
+  std::vector<int> steps_;  // of int4's blocks; 1 for others
   std::vector<std::byte> x_, packed_;
   std::vector<float> row_scale_, scale_, bias_, residual_;
 };
@@ -149,7 +168,7 @@ bool same(const std::vector<float>& a, const std::vector<float>& b) {
 
 TEST_CASE("int8 products of every shape are equal to whole numbers and single roundings, bit for bit") {
   counts = {};
-  for (CodeKind kind : {CodeKind::ternary, CodeKind::int8})
+  for (CodeKind kind : {CodeKind::ternary, CodeKind::int4, CodeKind::int8})
     for (const Case& c : kCases) {
       const Trial trial(kind, c);
       const std::vector<float> expected = trial.expected();

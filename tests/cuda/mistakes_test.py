@@ -50,10 +50,34 @@ MISTAKES = {
         "(1 - half) * 2 + lane / 16)",
     ),
     "fragments of codes swapped": (
-        "linear_int8.cu",
+        "packed_codes.h",
         "linear_int8",
-        "codes[n][0] >> 2 * s &",
-        "codes[n][0] >> 2 * (s ^ 1) &",
+        "words_[eight] >> 2 * i &",
+        "words_[eight] >> 2 * (i ^ 1) &",
+    ),
+    "halves of bytes swapped": (
+        "packed_codes.h",
+        "linear_int8",
+        ">> i % 2 * 4 &",
+        ">> (i + 1) % 2 * 4 &",
+    ),
+    "codes of four bits are not centred": (
+        "packed_codes.h",
+        "linear_int8",
+        "(0x80808080U - step * 0x08080808U)",
+        "0x80808080U",
+    ),
+    "steps of other columns": (
+        "packed_codes.h",
+        "linear_int8",
+        "steps_ >> 8 * eight &",
+        "steps_ >> 8 * (eight ^ 1) &",
+    ),
+    "steps of other lanes": (
+        "packed_codes.h",
+        "linear_int8",
+        "+ lane / 4 * 4)",
+        "+ lane % 8 * 4)",
     ),
     "rows of fragments in another order": (
         "linear_int8.cu",
@@ -369,8 +393,8 @@ MISTAKES = {
     "fragments of unpacked codes swapped": (
         "hopper_linear_int8.cu",
         "hopper_linear_int8",
-        "words[k] >> 2 * s &",
-        "words[k] >> 2 * (s ^ 1) &",
+        "codes.fragment(eight, i)",
+        "codes.fragment(eight, i ^ 1)",
     ),
     "codes of a tile behind the last": (
         "hopper_linear_int8.cu",

@@ -101,9 +101,10 @@ class Copy {
 
 TEST_CASE_FIXTURE(Driver, "matrices of every layout that are streamed give the bits of resident ones") {
   constexpr int kDepth = 160;  // large enough to be rounded
-  const std::pair<DType, Rounding> layouts[] = {{DType::f32, Rounding::none},  {DType::f16, Rounding::none},
-                                                {DType::bf16, Rounding::none}, {DType::bf16, Rounding::float32},
-                                                {DType::f32, Rounding::int8},  {DType::ternary, Rounding::none}};
+  const std::pair<DType, Rounding> layouts[] = {{DType::f32, Rounding::none},    {DType::f16, Rounding::none},
+                                                {DType::bf16, Rounding::none},   {DType::bf16, Rounding::float32},
+                                                {DType::f32, Rounding::int8},    {DType::f32, Rounding::int4},
+                                                {DType::ternary, Rounding::none}};
   for (const auto& [type, rounding] : layouts) {
     CAPTURE(dtype_name(type));
     CAPTURE(static_cast<int>(rounding));

@@ -17,16 +17,34 @@ IN_FLOAT32 = [*DEVICE, *FLOAT32]
 FAMILIES = sorted({Golden(name).arch for name in NAMES})
 
 
-def test_in_int8_an_answer_is_nearer_to_that_of_the_cpus_codes_than_to_float32(vla):
-    """The same codes of the same matrices; what lies between products is rounded in other places."""
+METAWORLD = ROOT / "models/metaworld-tiny.gguf"
+
+
+def act(vla, bundle, *options):
+    """The answer of a policy for MetaWorld to one recorded look."""
     frame = ROOT / "examples/metaworld/episodes/faucet-open/step_00.png"
     seen = ["--image", f"corner4={frame}", "--state", "0.0045,0.4003,0.1957,1", "--text", "open the faucet", "--seed", "1", "--json"]
-    run = lambda *options: vla("run", ROOT / "models/metaworld-tiny.gguf", *seen, *options, limit=300).json()  # noqa: E731
-    int8 = ["--kernels", "int8"]
-    gpu = run(*DEVICE, *int8)
+    return vla("run", bundle, *seen, *options, limit=300).json()
+
+
+@pytest.mark.parametrize("codes", ["int8", "int4"])
+def test_with_codes_an_answer_is_nearer_to_that_of_the_cpus_codes_than_to_float32(vla, codes):
+    """The same codes of the same matrices; what lies between products is rounded in other places."""
+    gpu = act(vla, METAWORLD, *DEVICE, "--kernels", codes)
     assert gpu["precision"] == "int8"
-    cpu, gpu, exact = (np.array(answer["actions"]) for answer in (run(*int8), gpu, run(*FLOAT32)))
-    assert 0 < np.abs(gpu - cpu).max() < np.abs(cpu - exact).max()
+    cpu, exact = (np.array(act(vla, METAWORLD, *options)["actions"]) for options in (["--kernels", codes], FLOAT32))
+    assert 0 < np.abs(np.array(gpu["actions"]) - cpu).max() < np.abs(cpu - exact).max()
+
+
+def test_stored_int4_codes_act_as_those_made_at_load_and_take_their_memory(vla, tmp_path):
+    small = tmp_path / "int4.gguf"
+    assert vla("quantize", METAWORLD, "-o", small, "--dtype", "int4").code == 0
+    made, stored = act(vla, METAWORLD, *DEVICE, "--kernels", "int4"), act(vla, small, *DEVICE)
+    assert stored["actions"] == made["actions"]
+    told = vla("inspect", small, *DEVICE).out
+    assert "linear_int4 (" in told and "linear_int8" not in told
+    weights = {bundle: json.loads(vla("inspect", bundle, *DEVICE, "--json").out)["memory_bytes"]["weights"] for bundle in (METAWORLD, small)}
+    assert weights[small] < 0.45 * weights[METAWORLD]
 
 
 def test_convolutions_of_int8_have_the_cpus_codes(vla, tmp_path):
@@ -53,7 +71,6 @@ def test_heads_that_nothing_turns_are_rounded_as_their_product_is_stored(vla):
 def test_kernels_that_a_build_lacks_are_refused_by_the_library_that_has_them(vla, golden):
     answer = vla(*golden.arguments(options=[*DEVICE, "--kernels", "ggml"]))
     answer.refused("device", "cuda:0: expected one of cpu", "no libvla-cuda-ggml.so in ")
-    vla(*golden.arguments(options=[*DEVICE, "--kernels", "int4"])).refused("usage", "with device cuda:0, found int4")
 
 
 def test_too_little_memory_an_old_driver_and_an_old_gpu_are_refused(vla, golden):

@@ -313,8 +313,8 @@ def test_a_machine_without_a_device_says_so_and_runs_the_cpu(with_library, golde
 
 def test_kernels_of_the_cpu_are_refused(vla, golden):
     answer = vla(*golden.arguments(options=["--device", KIND, "--kernels", "avx2"]))
-    int8 = ", int8" if KIND == "cuda" else ""
-    answer.refused("usage", f"kernels: expected none, float32, bf16{int8} or ggml with device {KIND}:0, found avx2")
+    codes = ", int8, int4" if KIND == "cuda" else ""
+    answer.refused("usage", f"kernels: expected none, float32, bf16{codes} or ggml with device {KIND}:0, found avx2")
 
 
 def test_bench_tells_the_device_and_no_share_of_the_cpus_peak_which_it_does_not_probe_between_acts(vla, golden):

@@ -48,12 +48,12 @@ def test_the_kit_tells_that_kernels_run_and_are_right_and_what_they_take(kit, tm
     assert found["card"] == "a GPU of tests" and found["driver"].startswith("driver for CUDA")
     checks = found["checks"]
     assert all(one["passed"] for one in checks.values())
-    assert {"cuda:0", "act in float32 beside the CPU's", "act in int8 beside the CPU's", "tests of kernels", "golden cases", "products"} <= set(checks)
+    assert {"cuda:0", "act in float32 beside the CPU's", "act in int8 beside the CPU's", "act in int4 beside the CPU's", "tests of kernels", "golden cases", "products"} <= set(checks)
     assert found["cases"] == {"passed": 2, "failed": []}
     family = found["families"]["smolvla"]
     assert family["stored"]["ms"]["network"] > 0 and family["int8"]["ms"]["network"] > 0
     assert family["predicted"]["model"] == "h100" and family["predicted"]["ms"]["steps"] > 0
-    assert {row["kind"] for row in found["products"]} == {"bf16", "ternary", "int8"}
+    assert {row["kind"] for row in found["products"]} == {"bf16", "ternary", "int4", "int8"}
     assert {row["kernel"] for row in found["attention"]} >= {"attention_bf16_64", "attention_f32"}
     with pytest.raises(SystemExit, match="driver of tests"):
         gpu_table.keep(tmp_path, tmp_path / "result.json")

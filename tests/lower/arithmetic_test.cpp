@@ -68,7 +68,7 @@ TEST_CASE("an unknown name is refused with the names that there are, on every de
   CHECK(gpu.error().expected.find("cuda:0") != std::string::npos);
 }
 
-TEST_CASE("on CUDA our own kernels compute unless ggml is asked for, on Vulkan ggml's alone, and int4 is the CPU's") {
+TEST_CASE("on CUDA our own kernels compute unless ggml is asked for, on Vulkan ggml's alone, which has no codes") {
   const auto own = Arithmetic::Backend::own, ggml = Arithmetic::Backend::ggml;
   const auto is = [](const char* kernels, const char* device, Arithmetic::Backend backend, Rounding at_load) {
     const auto found = Arithmetic::on_device(kernels, device);
@@ -78,13 +78,13 @@ TEST_CASE("on CUDA our own kernels compute unless ggml is asked for, on Vulkan g
   CHECK(is("float32", "cuda:0", own, Rounding::float32));
   CHECK(is("bf16", "cuda:0", own, Rounding::bf16));
   CHECK(is("int8", "cuda:0", own, Rounding::int8));
+  CHECK(is("int4", "cuda:0", own, Rounding::int4));
   CHECK(is("ggml", "cuda:0", ggml, Rounding::none));
   CHECK(is("", "vulkan:0", ggml, Rounding::none));
   CHECK(is("float32", "vulkan:0", ggml, Rounding::none));
   CHECK(is("bf16", "vulkan:0", ggml, Rounding::bf16));
   CHECK(is("ggml", "vulkan:0", ggml, Rounding::none));
-  CHECK(!Arithmetic::on_device("int8", "vulkan:0").ok());
-  CHECK(!Arithmetic::on_device("int4", "cuda:0").ok());
+  for (const char* codes : {"int8", "int4"}) CHECK(!Arithmetic::on_device(codes, "vulkan:0").ok());
 }
 
 TEST_CASE("features that other features imply are never there without them") {

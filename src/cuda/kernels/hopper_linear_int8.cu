@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include "cuda/kernels/hopper_tile.h"
-#include "cuda/kernels/linear_int8.h"
+#include "cuda/kernels/packed_codes.h"
 #include "cuda/kernels/row_scale.h"
 
 namespace vla::cuda {
@@ -26,37 +26,27 @@ class Codes {
     const int tile = column0 / Int8Tile::kColumns + warp() / 2,
               n = (job.n_column + Int8Tile::kColumns - 1) / Int8Tile::kColumns;
     is_there_ = tile < n;
-    from_ = job.weight + static_cast<std::int64_t>(is_there_ ? tile : 0) * n_tile_ * kTileBytes + lane() * 16;
+    from_ = job.weight + static_cast<std::int64_t>(is_there_ ? tile : 0) * n_tile_ * kTileBytes<kKind> + lane() * 16;
   }
   VLA_DEVICE void fetch(std::byte* packed, int step) const {
     const int tile = step * 2 + warp() % 2;
     const bool valid = is_there_ && tile < n_tile_;
-    const std::byte* from = from_ + static_cast<std::int64_t>(valid ? tile : 0) * kTileBytes;
+    const std::byte* from = from_ + static_cast<std::int64_t>(valid ? tile : 0) * kTileBytes<kKind>;
 #pragma unroll
-    for (int i = 0; i < kTileBytes; i += 512)
-      dev::copy_async(packed + warp() * kTileBytes + i + lane() * 16, from + i, valid ? 16 : 0);
+    for (int i = 0; i < kTileBytes<kKind>; i += 512)
+      dev::copy_async(packed + warp() * kTileBytes<kKind> + i + lane() * 16, from + i, valid ? 16 : 0);
   }
   /// Each thread reads only what it brought itself.
   VLA_DEVICE void unpack(const std::byte* packed, std::byte* rows) const {
-    packed += warp() * kTileBytes + lane() * 16;
+    packed += warp() * kTileBytes<kKind>;
+    const LaneCodes<kKind> codes([&](auto type, int at) { return dev::read<decltype(type)>(packed + at); });
 #pragma unroll
-    for (int i = 0; i < (kKind == CodeKind::ternary ? 1 : 4); ++i) {
-      const uint4 four = dev::read<uint4>(packed + i * 512);
-      const unsigned words[4] = {four.x, four.y, four.z, four.w};
+    for (int eight = 0; eight < 4; ++eight)
 #pragma unroll
-      for (int k = 0; k < 4; ++k) {
-        if constexpr (kKind == CodeKind::ternary) {
-#pragma unroll
-          for (int s = 0; s < 4; ++s) write(rows, k, s, words[k] >> 2 * s & 0x03030303U);
-        } else {
-          write(rows, i, k, words[k]);
-        }
-      }
-    }
+      for (int i = 0; i < 4; ++i) write(rows, eight, i, codes.fragment(eight, i));
   }
 
  private:
-  static constexpr int kTileBytes = kKind == CodeKind::ternary ? Int8Tile::kTernaryBytes : Int8Tile::kBytes;
   static VLA_DEVICE int warp() { return thread_index() / kLanes; }
   static VLA_DEVICE int lane() { return thread_index() % kLanes; }
   static VLA_DEVICE void write(std::byte* rows, int eight, int fragment, unsigned word) {

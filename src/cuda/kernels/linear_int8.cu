@@ -3,6 +3,7 @@
 #include "cuda/kernels/linear_int8.h"
 
 #include "cuda/kernels/finish.h"
+#include "cuda/kernels/packed_codes.h"
 #include "cuda/kernels/row_scale.h"
 #include "cuda/kernels/store_sums.h"
 
@@ -46,10 +47,9 @@ template <CodeKind kKind_, int kTilesM_, int kTilesN_>
 struct Shape {
   static constexpr CodeKind kKind = kKind_;
   static constexpr int kTilesM = kTilesM_, kTilesN = kTilesN_, kThreads = 128;
-  static constexpr int kStages = kKind == CodeKind::ternary ? 4 : 3;
+  static constexpr int kStages = int8_stages(kKind);
   static constexpr int kRows = 2 * kTilesM * 16, kColumns = 2 * kTilesN * 8;
-  static constexpr int kColumnBytes = kKind == CodeKind::ternary ? 16 : 64, kTileBytes = 32 * kColumnBytes;
-  static constexpr int kBytesX = kRows * kDepth, kBytesW = kColumns * kColumnBytes, kStage = kBytesX + kBytesW;
+  static constexpr int kBytesX = kRows * kDepth, kBytesW = kColumns * column_bytes(kKind), kStage = kBytesX + kBytesW;
 };
 
 /// Offset of 16 bytes of a row of x in a stage. The eight rows of a matrix load are in different banks.
@@ -69,12 +69,12 @@ VLA_DEVICE void fetch(const LinearInt8Job& job, int row0, int column0, int step,
   const int n_tile = (job.n_column + Int8Tile::kColumns - 1) / Int8Tile::kColumns;
 #pragma unroll
   for (int i = 0; i < S::kBytesW; i += S::kThreads * 16) {
-    const int at = i + thread * 16, tile = column0 / Int8Tile::kColumns + at / S::kTileBytes;
+    const int at = i + thread * 16, tile = column0 / Int8Tile::kColumns + at / kTileBytes<S::kKind>;
     if (S::kBytesW % (S::kThreads * 16) != 0 && at >= S::kBytesW) break;
     const bool valid = tile < n_tile;
     const std::int64_t first =
-        (static_cast<std::int64_t>(valid ? tile : 0) * (job.depth / kDepth) + step) * S::kTileBytes;
-    dev::copy_async(stage + S::kBytesX + at, job.weight + first + at % S::kTileBytes, valid ? 16 : 0);
+        (static_cast<std::int64_t>(valid ? tile : 0) * (job.depth / kDepth) + step) * kTileBytes<S::kKind>;
+    dev::copy_async(stage + S::kBytesX + at, job.weight + first + at % kTileBytes<S::kKind>, valid ? 16 : 0);
   }
 }
 
@@ -83,19 +83,12 @@ template <class S>
 VLA_DEVICE void multiply_stage(const std::byte* stage, int warp_row, int warp_column,
                                int (&sum)[S::kTilesM][S::kTilesN][4]) {
   const int lane = thread_index() % kLanes;
-  const std::byte* w = stage + S::kBytesX + warp_column / 32 * S::kTileBytes + lane * 16;
-  unsigned codes[S::kTilesN][4];  // for ternary weights the first is the word of 2-bit codes for all fragments
+  LaneCodes<S::kKind> codes[S::kTilesN / 4];
 #pragma unroll
-  for (int n = 0; n < S::kTilesN; n += S::kKind == CodeKind::ternary ? 4 : 1) {
-    const uint4 words = dev::read<uint4>(w + n / 4 * S::kTileBytes + n % 4 * 512);
-    if constexpr (S::kKind == CodeKind::ternary)
-      codes[n][0] = words.x, codes[n + 1][0] = words.y, codes[n + 2][0] = words.z, codes[n + 3][0] = words.w;
-    else
-      codes[n][0] = words.x, codes[n][1] = words.y, codes[n][2] = words.z, codes[n][3] = words.w;
+  for (int i = 0; i < S::kTilesN / 4; ++i) {
+    const std::byte* w = stage + S::kBytesX + (warp_column / Int8Tile::kColumns + i) * kTileBytes<S::kKind>;
+    codes[i] = LaneCodes<S::kKind>([&](auto type, int at) { return dev::read<decltype(type)>(w + at); });
   }
-  const auto fragment = [&](int n, int s) {
-    return S::kKind == CodeKind::ternary ? codes[n][0] >> 2 * s & 0x03030303U : codes[n][s];
-  };
 #pragma unroll
   for (int half = 0; half < 2; ++half) {
     unsigned a[S::kTilesM][4];
@@ -104,7 +97,8 @@ VLA_DEVICE void multiply_stage(const std::byte* stage, int warp_row, int warp_co
       dev::load_matrices(a[m], stage + x_place(warp_row + m * 16 + lane % 16, half * 2 + lane / 16));
 #pragma unroll
     for (int n = 0; n < S::kTilesN; ++n) {
-      const unsigned b0 = fragment(n, half * 2), b1 = fragment(n, half * 2 + 1);
+      const LaneCodes<S::kKind>& of = codes[n / 4];
+      const unsigned b0 = of.fragment(n % 4, half * 2), b1 = of.fragment(n % 4, half * 2 + 1);
 #pragma unroll
       for (int m = 0; m < S::kTilesM; ++m) dev::multiply_s8(sum[m][n], a[m], b0, b1);
     }
@@ -155,26 +149,16 @@ constexpr int kFewRows = 4;
 /// A warp computes a tile of columns; each lane sums a quarter of the depth for four of them.
 template <CodeKind kKind>
 VLA_DEVICE void multiply_few(const LinearInt8Job& job) {
-  constexpr int kTileBytes = kKind == CodeKind::ternary ? Int8Tile::kTernaryBytes : Int8Tile::kBytes;
   const int lane = thread_index() % kLanes, tile = static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes;
   const int row0 = static_cast<int>(blockIdx.y) * kFewRows;
   if (tile * Int8Tile::kColumns >= job.n_column) return;  // the whole warp
-  const std::byte* w = job.weight + static_cast<std::int64_t>(tile) * (job.depth / kDepth) * kTileBytes + lane * 16;
+  const std::byte* w = job.weight + static_cast<std::int64_t>(tile) * (job.depth / kDepth) * kTileBytes<kKind>;
   const Share share(job);
   int sum[kFewRows][4] = {};
   for (int step = share.first; step < share.end; ++step) {
-    unsigned codes[4][4];
-    const auto* words = reinterpret_cast<const uint4*>(w + static_cast<std::int64_t>(step) * kTileBytes);
-    if constexpr (kKind == CodeKind::ternary) {
-      const unsigned packed[4] = {words->x, words->y, words->z, words->w};
-#pragma unroll
-      for (int i = 0; i < 16; ++i) codes[i / 4][i % 4] = packed[i / 4] >> 2 * (i % 4) & 0x03030303U;
-    } else {
-#pragma unroll
-      for (int j = 0; j < 4; ++j)
-        codes[j][0] = words[32 * j].x, codes[j][1] = words[32 * j].y, codes[j][2] = words[32 * j].z,
-        codes[j][3] = words[32 * j].w;
-    }
+    const std::byte* of_step = w + static_cast<std::int64_t>(step) * kTileBytes<kKind>;
+    const LaneCodes<kKind> codes(
+        [&](auto type, int at) { return *reinterpret_cast<const decltype(type)*>(of_step + at); });
 #pragma unroll
     for (int r = 0; r < kFewRows; ++r) {
       if (row0 + r >= job.n_row) break;
@@ -183,7 +167,7 @@ VLA_DEVICE void multiply_few(const LinearInt8Job& job) {
       for (int s = 0; s < 4; ++s) {
         const unsigned four = *reinterpret_cast<const unsigned*>(x + 16 * s);
 #pragma unroll
-        for (int j = 0; j < 4; ++j) sum[r][j] = dev::dot4(four, codes[j][s], sum[r][j]);
+        for (int j = 0; j < 4; ++j) sum[r][j] = dev::dot4(four, codes.fragment(j, s), sum[r][j]);
       }
     }
   }
@@ -208,14 +192,19 @@ VLA_DEVICE void multiply_few(const LinearInt8Job& job) {
 
 using Ternary128 = Shape<CodeKind::ternary, 4, 8>;
 using Ternary64 = Shape<CodeKind::ternary, 2, 4>;
+using Nibbles128 = Shape<CodeKind::int4, 4, 8>;
+using Nibbles64 = Shape<CodeKind::int4, 2, 4>;
 using Bytes128 = Shape<CodeKind::int8, 4, 8>;
 using Bytes64 = Shape<CodeKind::int8, 2, 4>;
 
 VLA_EARLY_KERNEL(linear_ternary_128, 128, 2, LinearInt8Job) { multiply<Ternary128>(job); }
 VLA_EARLY_KERNEL(linear_ternary_64, 128, 4, LinearInt8Job) { multiply<Ternary64>(job); }
+VLA_EARLY_KERNEL(linear_int4_128, 128, 2, LinearInt8Job) { multiply<Nibbles128>(job); }
+VLA_EARLY_KERNEL(linear_int4_64, 128, 4, LinearInt8Job) { multiply<Nibbles64>(job); }
 VLA_EARLY_KERNEL(linear_int8_128, 128, 2, LinearInt8Job) { multiply<Bytes128>(job); }
 VLA_EARLY_KERNEL(linear_int8_64, 128, 4, LinearInt8Job) { multiply<Bytes64>(job); }
 VLA_KERNEL(linear_ternary_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::ternary>(job); }
+VLA_KERNEL(linear_int4_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::int4>(job); }
 VLA_KERNEL(linear_int8_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::int8>(job); }
 
 namespace {

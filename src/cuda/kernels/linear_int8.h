@@ -5,8 +5,8 @@
 #include "cuda/kernels/epilogue.h"
 #include "cuda/kernels/launch.h"
 
-/// Products of int8 rows and a matrix of ternary or int8 codes: exact sums, then float(sum) * (scale of the column /
-/// scale of the row) and the epilogue. Every operation is rounded separately, as in the kernels for CPUs
+/// Products of int8 rows and a matrix of ternary, int4 or int8 codes: exact sums, then float(sum) * (scale of the
+/// column / scale of the row) and the epilogue. Every operation is rounded separately, as in the kernels for CPUs
 /// (kernels/quantized.h).
 namespace vla::cuda {
 
@@ -19,10 +19,18 @@ namespace vla::cuda {
 /// ternary: 512 bytes; a word for every eight columns, 16 bytes of each lane. Byte b of it has a code plus 1 in two
 /// bits for each fragment, the first in the lowest, so that a shift by 2 s and a mask make the register. The 1 adds the
 /// row's sum of codes to every product, and comes off at the end.
+/// int4: 1056 bytes; two words for every eight columns, 16 bytes of each lane for every sixteen. Byte b of the first
+/// has the stored codes of fragments 0 and 1, the lower four bits first, and of the second those of 2 and 3. Then the
+/// steps of the columns (Int4Block), a word with that of column i of each eight for i from 0 to 7.
 struct Int8Tile {
   static constexpr int kColumns = 32, kDepth = 64;
-  static constexpr int kBytes = kColumns * kDepth, kTernaryBytes = kBytes / 4;
 };
+enum class CodeKind { ternary, int4, int8 };
+/// Bytes of a column of a tile.
+constexpr int column_bytes(CodeKind kind) { return kind == CodeKind::ternary ? 16 : kind == CodeKind::int4 ? 33 : 64; }
+constexpr int tile_bytes(CodeKind kind) { return Int8Tile::kColumns * column_bytes(kind); }
+template <CodeKind kKind>
+constexpr int kTileBytes = tile_bytes(kKind);
 
 struct LinearInt8Job {
   const std::byte* x;  // n_row rows of codes
@@ -37,29 +45,28 @@ struct LinearInt8Job {
   Epilogue end;
 };
 
-enum class CodeKind { ternary, int8 };
-
 /// Bytes of a packed matrix.
 std::size_t packed_int8_size(CodeKind kind, std::int64_t d_in, std::int64_t d_out);
-/// stored: d_out rows of d_in elements as in a bundle: int8, or ternary in two bits (DType::ternary).
+/// stored: d_out rows of d_in elements as in a bundle: int8, ternary in two bits (DType::ternary), or Int4Block.
 void pack_int8(CodeKind kind, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, std::byte* packed);
 
 /// Rows of a block on tensor cores.
 enum class Int8Shape { few, rows64, rows128 };
+/// Steps of the depth in shared memory.
+constexpr int int8_stages(CodeKind kind) { return kind == CodeKind::int8 ? 3 : 4; }
 inline Launch linear_int8(CodeKind kind, Int8Shape shape, const LinearInt8Job& job) {
-  const bool ternary = kind == CodeKind::ternary;
+  static constexpr const char* kNames[][3] = {{"linear_ternary_few", "linear_ternary_64", "linear_ternary_128"},
+                                              {"linear_int4_few", "linear_int4_64", "linear_int4_128"},
+                                              {"linear_int8_few", "linear_int8_64", "linear_int8_128"}};
+  const char* name = kNames[static_cast<int>(kind)][static_cast<int>(shape)];
   const auto splits = static_cast<unsigned>(job.n_split);
   if (shape == Int8Shape::few)  // four rows; a tile of columns for each of four warps
-    return {ternary ? "linear_ternary_few" : "linear_int8_few",
-            {blocks(job.n_column, 128), blocks(job.n_row, 4), splits},
-            128};
-  const unsigned size = shape == Int8Shape::rows64 ? 64 : 128, n_stage = ternary ? 4 : 3;
-  const char* name = shape == Int8Shape::rows64 ? (ternary ? "linear_ternary_64" : "linear_int8_64")
-                                                : (ternary ? "linear_ternary_128" : "linear_int8_128");
+    return {name, {blocks(job.n_column, 128), blocks(job.n_row, 4), splits}, 128};
+  const int size = shape == Int8Shape::rows64 ? 64 : 128;
   return {name,
           {blocks(job.n_column, size), blocks(job.n_row, size), splits},
           128,
-          n_stage * size * (Int8Tile::kDepth + (ternary ? 16 : 64))};
+          static_cast<unsigned>(int8_stages(kind) * size * (Int8Tile::kDepth + column_bytes(kind)))};
 }
 
 /// Tiles of kernels for Hopper alone (hopper_linear_int8.cu): columns, a multiple of 64, and rows, a multiple of 16.

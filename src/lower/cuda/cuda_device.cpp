@@ -16,7 +16,8 @@ constexpr std::int64_t kMinRoundedKeys = 32;
 
 /// Kernels that round x apply its norm, too.
 Multiplier multiplier_of(const CudaWeight& weight) {
-  static constexpr char kKinds[4] = {};  // distinct addresses, to tell kernels apart
+  static constexpr char kKinds[static_cast<int>(MatrixKind::int8) + 1] =
+      {};  // distinct addresses, to tell kernels apart
   const std::int64_t max_norm = weight.kind == MatrixKind::f32 ? 0 : kNoLimit;
   return {&kKinds[static_cast<int>(weight.kind)], max_norm, false, true, &weight.encoding};
 }
@@ -25,8 +26,6 @@ Multiplier multiplier_of(const CudaWeight& weight) {
 
 Result<std::unique_ptr<Device>> CudaDevice::open(const cuda::Driver& driver, int index,
                                                  const std::vector<std::string>& modules, Rounding at_load) {
-  if (at_load == Rounding::int4)
-    return Error{Code::unsupported, "kernels", "float32, bf16 or int8", "int4", "products of int4 are the CPU's"};
   VLA_TRY(std::shared_ptr<CudaQueue> queue, CudaQueue::open(driver, index, modules));
   const std::string name = "cuda:" + std::to_string(index) + ", " + queue->device_name();
   return std::unique_ptr<Device>(new CudaDevice(name, std::move(queue), at_load));
@@ -46,7 +45,8 @@ Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan& pl
   arena_.reset();  // a dry load leaves one without memory
   VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, plan, queue_));
   // Attention rounds if products do.
-  const bool rounds = weights_.has(MatrixKind::bf16) || weights_.has(MatrixKind::int8);
+  const bool rounds =
+      weights_.has(MatrixKind::bf16) || weights_.has(MatrixKind::int4) || weights_.has(MatrixKind::int8);
   min_rounded_keys_ = rounds ? kMinRoundedKeys : kNoLimit;
   return {};
 }
@@ -59,7 +59,7 @@ Result<WeightPlan> CudaDevice::plan_weights(const Program& prefix, const Program
 }
 
 Precision CudaDevice::precision() const {
-  if (weights_.has(MatrixKind::int8) || weights_.has(MatrixKind::ternary)) return Precision::int8;
+  if (weights_.has_codes()) return Precision::int8;
   return weights_.has(MatrixKind::bf16) ? Precision::bf16 : Precision::f32;
 }
 std::string CudaDevice::kernels() const {

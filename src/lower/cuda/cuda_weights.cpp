@@ -6,21 +6,16 @@
 #include <cstring>
 #include <map>
 
-#include "cuda/kernels/linear_int8.h"
-
 namespace vla::lower {
 namespace {
-
-constexpr const char* kKernels[] = {"linear_f32", "linear_bf16", "linear_ternary", "linear_int8"};
 
 MatrixKind kind_of(const Param& param, const Encoding& encoding, Rounding rounding) {
   if (param.storage != Storage::matrix) return MatrixKind::f32;
   if (encoding.type == DType::ternary) return MatrixKind::ternary;
+  if (encoding.type == DType::int4 && encoding.group == param.shape[0]) return MatrixKind::int4;
   if (encoding.type == DType::i8 && encoding.group == param.shape[0]) return MatrixKind::int8;
   return encoding.type == DType::bf16 && rounding != Rounding::float32 ? MatrixKind::bf16 : MatrixKind::f32;
 }
-
-bool has_codes(MatrixKind kind) { return kind == MatrixKind::ternary || kind == MatrixKind::int8; }
 
 std::size_t f32_size(const kernels::MatrixDesc& desc) { return dtype_size(DType::f32, desc.d_in * desc.d_out); }
 void pack_f32(const kernels::MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
@@ -51,22 +46,32 @@ void pack_codes(const kernels::MatrixDesc& desc, const std::byte* stored, std::b
 constexpr Packing kPacking[] = {{f32_size, pack_f32},
                                 {bf16_size, pack_bf16},
                                 {code_size<cuda::CodeKind::ternary>, pack_codes<cuda::CodeKind::ternary>},
+                                {code_size<cuda::CodeKind::int4>, pack_codes<cuda::CodeKind::int4>},
                                 {code_size<cuda::CodeKind::int8>, pack_codes<cuda::CodeKind::int8>}};
 
 MatrixPlace place_of(const Param& matrix, const CudaWeight& weight) {
   MatrixPlace place;
-  place.encoding = has_codes(weight.kind)            ? weight.encoding
+  place.encoding = is_of_codes(weight.kind)          ? weight.encoding
                    : weight.kind == MatrixKind::bf16 ? Encoding{DType::bf16}
                                                      : Encoding{DType::f32};
   place.packing = kPacking[static_cast<int>(weight.kind)];
-  place.n_scale = has_codes(weight.kind) ? matrix.shape[1] : 0;
+  place.n_scale = is_of_codes(weight.kind) ? matrix.shape[1] : 0;
   return place;
 }
 
 }  // namespace
 
+std::string kernel_name(MatrixKind kind) {
+  constexpr const char* kNames[] = {"f32", "bf16", "ternary", "int4", "int8"};
+  return std::string("linear_") + kNames[static_cast<int>(kind)];
+}
+
 bool CudaWeights::has(MatrixKind kind) const {
   return std::any_of(all_.begin(), all_.end(), [&](const CudaWeight& weight) { return weight.kind == kind; });
+}
+
+bool CudaWeights::has_codes() const {
+  return std::any_of(all_.begin(), all_.end(), [](const CudaWeight& weight) { return is_of_codes(weight.kind); });
 }
 
 std::size_t CudaWeights::size_of(const Param& matrix) const {
@@ -95,8 +100,7 @@ void CudaWeights::choose(const ParamList& list, Rounding rounding) {
     if (param.storage == Storage::matrix) ++counts[{weight.kind, dtype_name(param.encoding.type)}];
   }
   for (const auto& [what, n] : counts)
-    text_ += (text_.empty() ? "" : ", ") + std::string(kKernels[static_cast<int>(what.first)]) + " (" +
-             std::to_string(n) + " " + what.second + ")";
+    text_ += (text_.empty() ? "" : ", ") + kernel_name(what.first) + " (" + std::to_string(n) + " " + what.second + ")";
 }
 
 /// Places resident parameters one after the other, then the windows.
@@ -118,7 +122,7 @@ Status CudaWeights::give_places(const ParamList& list, const WeightPlan& plan, C
   for (const Param& param : list.params()) {
     CudaWeight& weight = at(param);
     weight.data += memory_->address();
-    if (has_codes(weight.kind)) weight.scales = weight.data + place_of(param, weight).scales_begin(param);
+    if (is_of_codes(weight.kind)) weight.scales = weight.data + place_of(param, weight).scales_begin(param);
   }
   return {};
 }

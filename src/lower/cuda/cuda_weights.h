@@ -6,21 +6,31 @@
 #include <string>
 #include <vector>
 
+#include "cuda/kernels/linear_int8.h"
 #include "graph/rounding.h"
 #include "lower/cuda/cuda_windows.h"
 
 namespace vla::lower {
 
-/// The kernels that multiply by a matrix. bf16 kernels read rows of bf16; ternary and int8 kernels read rows of int8
-/// codes.
-enum class MatrixKind { f32, bf16, ternary, int8 };
+/// The kernels that multiply by a matrix. bf16 kernels read rows of bf16; ternary, int4 and int8 kernels read rows of
+/// int8 codes.
+enum class MatrixKind { f32, bf16, ternary, int4, int8 };
+constexpr bool is_of_codes(MatrixKind kind) { return kind >= MatrixKind::ternary; }
+/// Of a matrix of codes.
+constexpr cuda::CodeKind code_kind(MatrixKind kind) {
+  return static_cast<cuda::CodeKind>(static_cast<int>(kind) - static_cast<int>(MatrixKind::ternary));
+}
+static_assert(code_kind(MatrixKind::int8) == cuda::CodeKind::int8);
+
+/// As in `linear_bf16`, of which the kernels' names are made.
+std::string kernel_name(MatrixKind kind);
 
 /// A parameter's address and layout on the device: vectors and float32 matrices as float32, tables as stored, other
 /// matrices as their kernels read them.
 struct CudaWeight {
   MatrixKind kind = MatrixKind::f32;
   Encoding encoding;
-  cuda::Address data = 0, scales = 0;  // scales [d_out] of ternary and int8 matrices
+  cuda::Address data = 0, scales = 0;  // scales [d_out] of matrices of codes
 };
 
 /// bf16 rows are padded to a multiple of 8 elements.
@@ -28,8 +38,8 @@ constexpr std::int64_t bf16_stride(std::int64_t n) { return cuda::round_up(n, 8)
 
 class CudaWeights {
  public:
-  /// Loads the parameters. Matrices stored as bf16 are multiplied as bf16. at_load bf16 or int8 converts large float
-  /// matrices to it; float32 converts all but ternary ones to float32. fill: whether to read the file. plan: the
+  /// Loads the parameters. Matrices stored as bf16 are multiplied as bf16. at_load bf16, int8 or int4 converts large
+  /// float matrices to it; float32 converts all but ternary ones to float32. fill: whether to read the file. plan: the
   /// matrices that are streamed from it in every act. Errors: out_of_memory, bad_bundle, device.
   static Result<CudaWeights> load(const ParamList& list, Rounding rounding, bool fill, const WeightPlan& plan,
                                   const std::shared_ptr<CudaQueue>& queue);
@@ -44,6 +54,7 @@ class CudaWeights {
   /// The windows of streamed groups; null if there are none or the weights were not read.
   const std::shared_ptr<DeviceWindows>& windows() const { return windows_; }
   bool has(MatrixKind kind) const;
+  bool has_codes() const;
   /// The kernels, and how many matrices each multiplies: `linear_bf16 (98 bf16), linear_f32 (3 f32)`
   const std::string& text() const { return text_; }
 

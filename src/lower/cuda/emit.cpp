@@ -8,7 +8,8 @@ namespace {
 double size_of(const Value& value) { return static_cast<double>(dtype_size(value.type, count(value.shape))); }
 
 double bits_of(MatrixKind kind) {
-  return kind == MatrixKind::ternary ? 2 : kind == MatrixKind::int8 ? 8 : kind == MatrixKind::bf16 ? 16 : 32;
+  if (is_of_codes(kind)) return cuda::column_bytes(code_kind(kind)) * 8.0 / cuda::Int8Tile::kDepth;
+  return kind == MatrixKind::bf16 ? 16 : 32;
 }
 
 }  // namespace
@@ -35,7 +36,7 @@ Work work_of(const CudaLowering& l, const CudaOp& op) {
   if (const auto* linear = std::get_if<LinearOp>(&op.op))
     for (const Node* node : linear->linears) {
       const MatrixKind kind = l.matrix(*node).kind;
-      if (kind == MatrixKind::ternary || kind == MatrixKind::int8) work.int8 += flop_of(*node);
+      if (is_of_codes(kind)) work.int8 += flop_of(*node);
       work.weights += bits_of(kind) / 8 * static_cast<double>(node->as<op::Linear>()->weight->count());
     }
   if (const auto* lookup = std::get_if<LookupOp>(&op.op); lookup != nullptr && lookup->table != kNone)

@@ -89,7 +89,9 @@ constexpr Loop kLoops[] = {
     {"linear_bf16_64", 163, 16, 94, 32, 2 * 64 * 64, 4},
     {"linear_bf16_128", 333, 64, 227, 32, 2 * 128 * 64, 4},
     {"linear_ternary_64", 122, 16, 90, 64, 64 * (64 + 16), 4},
-    {"linear_ternary_128", 228, 64, 204, 64, 128 * (64 + 16), 4},
+    {"linear_ternary_128", 228, 64, 206, 64, 128 * (64 + 16), 4},
+    {"linear_int4_64", 188, 16, 100, 64, 64 * (64 + 33), 4},
+    {"linear_int4_128", 366, 64, 224, 64, 128 * (64 + 33), 4},
     {"linear_int8_64", 98, 16, 96, 64, 2 * 64 * 64, 3},
     {"linear_int8_128", 200, 64, 238, 64, 2 * 128 * 64, 3},
     {"attention_bf16_64", 762, 64, 161, 64, 2 * 64 * (2 * 64 + 16), 2},
@@ -160,7 +162,6 @@ class Costs {
       const Param& weight = *node->as<op::Linear>()->weight;
       const MatrixKind kind = l.matrix(*node).kind;
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
-      const bool has_codes = kind == MatrixKind::ternary || kind == MatrixKind::int8;
       const auto [shape, n_split, tile, us] = op.cut;
       const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
@@ -175,13 +176,12 @@ class Costs {
         const std::int64_t bytes = (std::min<std::int64_t>(rows, 64) + width) * weight.shape[0] * 2 / n_split;
         add_blocks(cost, static_cast<double>(n_block), static_cast<double>(bytes) / (kSmBytes * gpu.clock));
       } else if (shape == ProductShape::few) {
-        add_blocks(cost, gpu.n_sm, flop_of(*node) / (has_codes ? gpu.dot4 : gpu.f32));
+        add_blocks(cost, gpu.n_sm, flop_of(*node) / (is_of_codes(kind) ? gpu.dot4 : gpu.f32));
       } else {
-        const char* name = kind == MatrixKind::bf16 ? "bf16" : kind == MatrixKind::int8 ? "int8" : "ternary";
-        const Loop& loop = loop_of(std::string("linear_") + name + (size == 128 ? "_128" : "_64"));
+        const Loop& loop = loop_of(kernel_name(kind) + (size == 128 ? "_128" : "_64"));
         const double n_step = std::ceil(static_cast<double>(weight.shape[0]) / loop.step / n_split);
-        add_loops(cost, tiles * n_split, n_step, loop, has_codes ? gpu.int8 : gpu.bf16,
-                  2 * 16 * 8 * (has_codes ? 32 : 16));
+        add_loops(cost, tiles * n_split, n_step, loop, is_of_codes(kind) ? gpu.int8 : gpu.bf16,
+                  2 * 16 * 8 * (is_of_codes(kind) ? 32 : 16));
       }
     }
   }

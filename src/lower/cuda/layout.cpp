@@ -75,7 +75,7 @@ class CudaLayouts final : Layouts {
     const std::int64_t depth = l.value(op.x).shape[0], n_row = count(y) / y[0];
     const bool is_one = op.gated && multiplies_both(op, n_row);
     const ProductCut cut = cut_product(l, kind, n_row, is_one ? 2 * y[0] : y[0], depth, is_one);
-    if (kind == MatrixKind::ternary || kind == MatrixKind::int8)
+    if (is_of_codes(kind))
       round(step, op, DType::i8, kernels::quantized_stride(depth), "round");
     else if (kind == MatrixKind::bf16 && cut.shape != ProductShape::few)
       round(step, op, DType::bf16, bf16_stride(depth), "round");
@@ -262,7 +262,8 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
                        std::int64_t depth, bool is_gated) {
   const int n_sm = l.n_sm;
   const bool is_bf16 = kind == MatrixKind::bf16, is_few = n_row <= (is_bf16 ? cuda::kBf16FewRows : 4);
-  const bool has_tiles = l.is_hopper && kind != MatrixKind::f32 && !is_few;
+  // No tile for Hopper expands int4's codes.
+  const bool has_tiles = l.is_hopper && kind != MatrixKind::f32 && kind != MatrixKind::int4 && !is_few;
   const HopperCutFor tables = is_gated ? HopperCutFor::gated : HopperCutFor::one;
   if (is_bf16 && is_of_strips(n_row, depth)) {
     const ProductCut strips = cut_in_strips(n_row, n_column, depth, n_sm);

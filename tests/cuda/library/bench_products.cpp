@@ -99,6 +99,7 @@ class Bench {
     end.y = y.as<void>(), end.y_stride = columns;
     VLA_CHECK(run_bf16(size, partial, end));
     VLA_CHECK(run_codes("ternary", CodeKind::ternary, numbers_.ternary(kPattern), size, partial, end));
+    VLA_CHECK(run_codes("int4", CodeKind::int4, numbers_.int8(kPattern), size, partial, end));
     return run_codes("int8", CodeKind::int8, numbers_.int8(kPattern), size, partial, end);
   }
 

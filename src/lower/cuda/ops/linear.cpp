@@ -73,6 +73,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
       return;
     }
     case MatrixKind::ternary:
+    case MatrixKind::int4:
     case MatrixKind::int8: {
       const cuda::LinearInt8Job job = {.x = l.at<std::byte>(of),
                                        .weight = l.param<std::byte>(&weight),
@@ -84,9 +85,9 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .n_split = n_split,
                                        .partial = l.at<int>(op.partial),
                                        .end = end};
-      const auto kind = matrix.kind == MatrixKind::ternary ? cuda::CodeKind::ternary : cuda::CodeKind::int8;
-      calls.push_back(call(shape == ProductShape::hopper ? cuda::hopper_linear_int8(cuda::kHopperInt8Tiles[tile], job)
-                                                         : cuda::linear_int8(kind, int8_shape(shape), job),
+      calls.push_back(call(shape == ProductShape::hopper
+                               ? cuda::hopper_linear_int8(cuda::kHopperInt8Tiles[tile], job)
+                               : cuda::linear_int8(code_kind(matrix.kind), int8_shape(shape), job),
                            job));
       if (job.n_split > 1) calls.push_back(call(cuda::finish_int8_partial(job), job));
       return;
