@@ -14,6 +14,15 @@ function(vla_group target)
   set_target_properties(${target} PROPERTIES UNITY_BUILD ${VLA_UNITY} UNITY_BUILD_BATCH_SIZE 8)
 endfunction()
 
+# For what runs once, or waits for others all the time: compiling it takes longer than it will ever run.
+function(vla_optimize_little target)
+  if(VLA_SANITIZE)
+    target_compile_options(${target} PRIVATE -O0)
+  else()
+    target_compile_options(${target} PRIVATE -O1)
+  endif()
+endfunction()
+
 function(vla_precompile target)
   if(VLA_UNITY)
     target_precompile_headers(${target} PRIVATE ${ARGN})
