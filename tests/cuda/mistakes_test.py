@@ -461,7 +461,7 @@ MISTAKES = {
     ),
     "keys of an earlier segment": ("attention.cu", "attention", "from_ + (first - begin_) * token_", "from_ + first * token_"),
     "heads of another group": (
-        "attention.cu",
+        "attention_rows.h",
         "attention",
         "unit.head_kv * job.group() + row % job.group()",
         "unit.head_kv + row % job.group() * job.n_head_kv",
@@ -480,8 +480,8 @@ MISTAKES = {
     ),
     "sums of every second product": ("attention.cu", "attention", "if constexpr (S::kSums > 1) add", "if (false) add"),
     "shares of the keys are not weighed": (
-        "attention.cu",
-        "attention",
+        "attention_f32.cu",
+        "attention_f32",
         "sums[j] += values[z][j] * weight;",
         "sums[j] += values[z][j];",
     ),
@@ -573,7 +573,7 @@ MISTAKES |= {
     "a long row is looked up from its beginning only": ("rows.cu", "rows", "static_cast<int>(blockIdx.y) * kLookupBlock", "0"),
 }
 TESTS = {"linear_strip": "*linear_float_test*", "linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*", "hopper_linear_int8": "*linear_int8_test*",
-         "attention": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*", "channel_attention": "*channel_attention_test*"}  # fmt: skip
+         "attention": "*attention_test*", "attention_f32": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*", "channel_attention": "*channel_attention_test*"}  # fmt: skip
 
 
 def outcome(name, ptx, folder):
