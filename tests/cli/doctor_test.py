@@ -23,6 +23,14 @@ def report(vla):
     return json.loads(answer.out)
 
 
+@pytest.fixture
+def timed(vla):
+    """The program, where its times are those of its kernels."""
+    if vla.is_sanitized():
+        pytest.skip("a sanitizer slows the kernels down")
+    return vla
+
+
 def test_the_machine_and_the_build_are_told_without_a_bundle(vla):
     answer = vla("doctor")
     assert answer.code == 0
@@ -41,20 +49,18 @@ def test_json_has_machine_build_and_policy(report):
     assert policy["act_ms"] == pytest.approx(network + policy["host_ms"], rel=1e-3)
 
 
-def test_int8_is_named_where_its_prediction_is_a_gain(vla):
-    told = re.findall(r"--kernels int8: ([\d.]+) ms of the network predicted instead of ([\d.]+)", vla("doctor", DEMO, "--threads", 1).out)
+def test_int8_is_named_where_its_prediction_is_a_gain(timed):
+    told = re.findall(r"--kernels int8: ([\d.]+) ms of the network predicted instead of ([\d.]+)", timed("doctor", DEMO, "--threads", 1).out)
     for int8, own in told:
         assert float(int8) < 0.9 * float(own) + 0.01
 
 
 @pytest.mark.parametrize("kernels", ["float32", "int8"])
-def test_prediction_and_measurement_agree(vla, kernels):
+def test_prediction_and_measurement_agree(timed, kernels):
     """In one of five runs: what others do on the machine slows down one of the two in any of them."""
-    if vla.is_sanitized():
-        pytest.skip("a sanitizer slows the kernels down")
     found = []
     for _ in range(5):
-        policy = vla("doctor", DEMO, "--threads", 1, "--kernels", kernels, "--json").json()["policy"]
+        policy = timed("doctor", DEMO, "--threads", 1, "--kernels", kernels, "--json").json()["policy"]
         *stages, network = policy["stages"].values()
         assert (policy["int8_predicted_ms"] is None) == (kernels == "int8")
         assert sum(stage["predicted_ms"] for stage in stages) == pytest.approx(network["predicted_ms"])
@@ -64,11 +70,11 @@ def test_prediction_and_measurement_agree(vla, kernels):
     pytest.fail("measured and predicted, ms: {}".format(found))
 
 
-def test_an_act_of_a_few_milliseconds_is_measured_on_one_thread_too(vla, report):
+def test_an_act_of_a_few_milliseconds_is_measured_on_one_thread_too(timed, report):
     policy = report["policy"]
     assert ("one_thread_act_ms" in policy) == (policy["threads"] > 1 and policy["act_ms"] < 250)
-    answer = vla("doctor", DEMO, "--threads", 1)
-    is_late = "the rate is not held" in answer.out  # as under a sanitizer
+    answer = timed("doctor", DEMO, "--threads", 1)
+    is_late = "the rate is not held" in answer.out  # on a busy machine
     assert answer.code == (LATE if is_late else 0) and "predicted ms  measured ms" in answer.out and "replan every" in answer.out
     assert answer.out.count("\n") <= 40
 
@@ -82,12 +88,12 @@ def test_what_is_refused_is_told_after_the_machine(vla, tmp_path):
     assert vla("doctor", DEMO, "--device", "cuda:77").code == 8
 
 
-def test_a_chunk_that_ends_before_the_next_is_there_has_its_exit_code(vla, tmp_path):
+def test_a_chunk_that_ends_before_the_next_is_there_has_its_exit_code(timed, tmp_path):
     data = bytearray(DEMO.read_bytes())
     at = data.index(b"action.rate_hz") + len("action.rate_hz")
     kind, rate = struct.unpack_from("<If", data, at)
     assert (kind, rate) == (6, 80)  # float32
     struct.pack_into("<f", data, at + 4, 1e5)
     (tmp_path / "fast.gguf").write_bytes(sealed(bytes(data)))
-    answer = vla("doctor", tmp_path / "fast.gguf", "--threads", 1)
+    answer = timed("doctor", tmp_path / "fast.gguf", "--threads", 1)
     assert answer.code == LATE and "the rate is not held" in answer.out and "error: late" in answer.err
