@@ -216,3 +216,28 @@ def test_the_example_of_a_controller_moves_within_its_limits(faulty, tmp_path):
     (tmp_path / "limits.json").write_text(other)
     refused = subprocess.run([tmp_path / "controller", *arguments], capture_output=True, text=True, timeout=SECONDS)
     assert refused.returncode == 1 and "expected the actions of double.gguf: a, b, found without b" in refused.stderr
+
+
+def test_the_loop_of_a_simulator_gets_its_chunks_as_late_as_it_says(faulty, tmp_path):
+    """A scripted simulator of two joints: 0.1 s are five periods of 50 Hz, in which the robot waits or holds."""
+    build = Path(TOOL).parents[1]
+    command = ["c++", "-std=c++20", "-Wall", "-Wextra", "-pedantic", "-Werror", f"-I{ROOT}/include", ROOT / "examples/cpp/simulated.cpp"]
+    subprocess.run([*command, f"-L{build}/lib", "-lvla-control", f"-Wl,-rpath,{build}/lib", "-o", tmp_path / "simulated"], check=True)
+    faulty.on_act = lambda request: [response(request, chunk=chunk(0.25))]
+    faulty.description.n_action_steps = 2
+    arguments = [tmp_path / "simulated", faulty.address, "observation.images.top", "observation.state", "go"]
+    for mode, expected in (("sync", (0.15, "command")), ("async", (0.05, "none"))):
+        process = subprocess.Popen([*arguments, mode, "0.1"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        process.stdin.write(b"step 0.05 1 2\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == b"look\n"
+        process.stdin.write(b"2 1\n" + bytes(6))
+        process.stdin.flush()
+        seconds, state, *values = process.stdout.readline().split()
+        assert (float(seconds), state.decode()) == expected and list(map(float, values)) == [0.25] * (2 * (mode == "sync"))
+        assert list(faulty.acts[-1].act.states[0].values) == [1, 2] and process.poll() is None
+        process.stdin.close()
+        assert process.wait(SECONDS) == 0
+        process.stdout.close()
+    refused = subprocess.run([*arguments, "rtc", "0.1"], capture_output=True, text=True, timeout=SECONDS)
+    assert refused.returncode == 1 and "expected sync or async, found rtc" in refused.stderr

@@ -1,10 +1,15 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from vla_cpp.eval.environment import EnvironmentFault, Guard, Observation
 from vla_cpp.eval.environments import NAMES, find, make
 from vla_cpp.eval.environments.null import Null
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class Lying(Null):
@@ -93,3 +98,22 @@ def test_metaworld_draws_and_steps_as_declared():
         frames.append(guard.observe().frames["corner4"])
     assert (frames[0] == frames[2]).all() and (frames[0] != frames[1]).any()
     assert guard.step(np.zeros(4, np.float32)) is False
+
+
+def test_aloha_steps_as_gym_aloha_does_and_its_cube_can_be_handed_over():
+    gymnasium = pytest.importorskip("gym_aloha.env", reason="gym-aloha is not installed here: pip install gym-aloha==0.1.5")
+    sys.path.insert(0, str(ROOT / "examples/aloha"))
+    from expert import Expert
+
+    ours, theirs = make("aloha", "transfer_cube"), gymnasium.AlohaEnv("transfer_cube", obs_type="pixels_agent_pos")
+    ours.reset(3)
+    theirs.reset(seed=3)
+    expert = Expert(ours)
+    for _ in range(3):
+        action = expert()
+        ours.step(action)
+        seen = theirs.step(action)[0]
+        assert np.array_equal(ours.state(), seen["agent_pos"].astype(np.float32))
+    guard = Guard(ours)
+    assert guard.observe().frames["top"].shape == (96, 128, 3)
+    assert any(ours.step(expert()) for _ in range(250)) and ours.facts() == {"reward": 4.0}

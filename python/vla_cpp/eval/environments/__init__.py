@@ -9,7 +9,7 @@ from typing import Any, Type
 
 from ..environment import Environment
 
-_HOMES = {"metaworld": "MetaWorld", "libero": "Libero", "null": "Null"}
+_HOMES = {"metaworld": "MetaWorld", "libero": "Libero", "aloha": "Aloha", "null": "Null"}
 NAMES = tuple(_HOMES)
 
 
