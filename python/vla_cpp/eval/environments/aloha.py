@@ -38,7 +38,7 @@ def _import() -> Any:
         from gym_aloha.tasks import sim
         from gym_aloha.utils import sample_box_pose
     except ImportError as error:
-        raise MissingSimulator(f"{error}: pip install gym-aloha==0.1.5") from error
+        raise MissingSimulator(f"{error}: pip install gym-aloha==0.1.5 mujoco==3.8.1") from error
     return mujoco, str(ASSETS_DIR / "bimanual_viperx_transfer_cube.xml"), sim, sample_box_pose
 
 
