@@ -6,8 +6,7 @@
     python latency.py --bundle policy.gguf --vla build/cpu/bin/vla --loop simulated --ms 0,150,300,500 --modes sync,async
 
 A chunk arrives so many milliseconds after its observation, however long the policy takes. Prints a Markdown table: episodes solved with
-the Wilson interval, median steps of those, the share of periods without a new command, and the acceleration where a new chunk takes
-over, over that elsewhere.
+the Wilson interval, median steps of those, and the share of periods without a new command.
 """
 
 import argparse
@@ -34,7 +33,7 @@ class Loop:
         self._send(b"reset\n")
 
     def step(self, environment):
-        """(action or None, periods that passed before it, whether it is a new one)."""
+        """(the next action or None, periods that the robot waited for it, whether it is a row of a chunk)."""
         begun = self._now
         self._send(" ".join(map(str, ["step", f"{begun:.6f}", *environment.state()])).encode() + b"\n")
         while (line := self._process.stdout.readline()) == b"look\n":
@@ -53,7 +52,7 @@ class Loop:
 
 
 def episode(environment, loop, seed):
-    """(steps until it is solved or None, periods held, periods, the largest change of a command's rate at any period)."""
+    """(steps until it is solved or None, periods without a new command, periods)."""
     environment.reset(seed)
     loop.reset()
     action, held, step = environment.state(), 0, 0

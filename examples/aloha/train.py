@@ -61,20 +61,16 @@ def make_policy(statistics):
     return (ACTPolicy(config).float(), *make_act_pre_post_processors(config, statistics))
 
 
-def norms(tower, replaced=None):
-    """Puts what `replaced` makes of each normalization of the tower in its place."""
+def let_norms_learn(tower):
     for name, child in tower.named_children():
-        new = replaced(child)
-        if new is not None:
-            setattr(tower, name, new)
-        norms(child, replaced)
-
-
-def learned(frozen):
-    return nn.BatchNorm2d(len(frozen.weight), momentum=0.03) if type(frozen).__name__ == "FrozenBatchNorm2d" else None
+        if type(child).__name__ == "FrozenBatchNorm2d":
+            setattr(tower, name, nn.BatchNorm2d(len(child.weight), momentum=0.03))
+        let_norms_learn(child)
 
 
 def export(policy, before, after, statistics, out):
+    """Writes the published layout. Numbers are bf16's, stored as float32: the tower's normalizations still become part of its
+    products where a bundle is made."""
     fresh, *_ = make_policy(statistics)
     fresh.load_state_dict({key: value for key, value in policy.state_dict().items() if not key.endswith("num_batches_tracked")})
     with torch.no_grad():
@@ -104,7 +100,7 @@ def main():
     pixels = data.frames[::37].float() / 255
     statistics[VIEW] = {"mean": pixels.mean((0, 1, 2))[:, None, None], "std": pixels.std((0, 1, 2))[:, None, None]}
     policy, before, after = make_policy(statistics)
-    norms(policy.model.backbone, learned)
+    let_norms_learn(policy.model.backbone)
     policy.model.backbone.to(memory_format=torch.channels_last)
     policy.train()
     asked = nn.Linear(512 * math.ceil(HEIGHT / 32) * math.ceil(WIDTH / 32), 2)
