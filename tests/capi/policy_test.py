@@ -109,6 +109,15 @@ def test_the_policy_for_libero_answers_a_recorded_look_as_pytorch_did():
     assert np.abs(np.asarray(chunk) - expected).max() < 1e-6 * np.abs(expected).max()
 
 
+def test_the_policy_for_aloha_answers_a_recorded_look_nearly_as_pytorch_did_before_it_was_quantized():
+    look = ROOT / "examples/aloha/look"
+    told, expected = json.loads((look / "look.json").read_text()), np.load(look / "expected.npy")
+    with vla_cpp.Policy(ROOT / "models/aloha-cube-tiny.gguf", threads=1, kernels="float32") as policy:
+        chunk = np.asarray(policy.act(images={"observation.images.top": (look / "top.png").read_bytes()}, state=told["state"]))
+        assert policy.spec.action_names[0] == "left_waist" and policy.spec.rate_hz == 50
+    assert 0 < np.sqrt(np.mean((chunk - expected) ** 2) / np.mean(expected**2)) < 0.02
+
+
 def test_without_seed_and_noise_the_seed_that_was_drawn_gives_the_chunk_again(act):
     first, second = act(seed=None), act(seed=None)
     assert first.seed != second.seed and not np.array_equal(first, second)

@@ -59,7 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("vla-eval", description=__doc__, epilog=EPILOG, formatter_class=formatter)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in NAMES:
-        text = {"metaworld": "four MetaWorld tasks", "libero": "LIBERO and LIBERO-PRO, by suite", "null": "no simulator: tries the harness"}[name]
+        text = {"metaworld": "four MetaWorld tasks", "libero": "LIBERO and LIBERO-PRO, by suite", "aloha": "two arms that hand a cube over", "null": "no simulator: tries the harness"}[name]
         command = commands.add_parser(name, help=text, description=(find(name).__doc__ or text), formatter_class=formatter)
         _common(command)
         if find(name).suites():
