@@ -15,6 +15,8 @@ from conftest import run_tests
 MAIN_LOOPS = {
     "linear_ternary_128": ("IMMA.16832.S8.S8", 64),
     "linear_ternary_64": ("IMMA.16832.S8.S8", 16),
+    "linear_int4_128": ("IMMA.16832.S8.S8", 64),
+    "linear_int4_64": ("IMMA.16832.S8.S8", 16),
     "linear_int8_128": ("IMMA.16832.S8.S8", 64),
     "linear_int8_64": ("IMMA.16832.S8.S8", 16),
     "linear_bf16_128": ("HMMA.16816.F32.BF16", 64),
