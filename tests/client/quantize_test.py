@@ -179,8 +179,11 @@ def test_a_search_takes_int4_by_hessians(recording, tmp_path):
     assert "rounded by Hessians" in told
 
 
-@pytest.mark.parametrize("what", [["--calibrate"], ["--dtype", "int4", "--calibrate"], ["--error", 0.025, "--judge"]])
-def test_a_budget_changes_no_byte_and_is_kept(recording, tmp_path, what):
+# What a budget saves at least: observations and second moments of a calibration; a search alone has little beside a policy.
+@pytest.mark.parametrize(
+    ("what", "saves"), [(["--calibrate"], 10e6), (["--dtype", "int4", "--calibrate"], 10e6), (["--error", 0.025, "--judge"], 0)]
+)
+def test_a_budget_changes_no_byte_and_is_kept(recording, tmp_path, what, saves):
     def made(name, *memory):
         return peak_of("quantize", SHIPPED.bundle, "-o", tmp_path / name, "--threads", 1, *what, recording, *memory)
 
@@ -192,7 +195,7 @@ def test_a_budget_changes_no_byte_and_is_kept(recording, tmp_path, what):
         if not refused:
             break
     assert not refused
-    assert tight < roomy - 2_000_000 or b"__asan_init" in VLA.read_bytes()  # a sanitizer takes more than the policy
+    assert tight < roomy - saves or b"__asan_init" in VLA.read_bytes()  # a sanitizer takes more than the policy
     assert (tmp_path / "tight.gguf").read_bytes() == (tmp_path / "roomy.gguf").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["roomy.gguf", "tight.gguf"]
 
