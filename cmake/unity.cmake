@@ -14,7 +14,7 @@ function(vla_group target)
   set_target_properties(${target} PROPERTIES UNITY_BUILD ${VLA_UNITY} UNITY_BUILD_BATCH_SIZE 8)
 endfunction()
 
-# For what runs once, or waits for others all the time: compiling it takes longer than it will ever run.
+# For code that runs once, at load or in a test: compiling it takes longer than running it.
 function(vla_optimize_little target)
   if(VLA_SANITIZE)
     target_compile_options(${target} PRIVATE -O0)

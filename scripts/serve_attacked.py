@@ -148,7 +148,7 @@ def missed(options, names, quiet, attacked, rest):
         bar(f"{name}: lost", rest["lost"][name], float("inf") if own else 0)
         bar(f"{name}: back after", rest["back"][name], BACK_S * loose, " s")
         for q in (50, 95) if name in ROBOTS and not own else ():
-            paused_ms = HEALTH_MS * loose if loose > 1 and q > 50 else 0  # by other work: a twentieth of a few seconds is one pause
+            paused_ms = HEALTH_MS * loose if loose > 1 and q > 50 else 0  # one pause of the machine is a twentieth of a short measurement
             bar(f"{name} p{q}", p(attacked[name], q), max(ACT_RATIO * loose * p(quiet[name], q), paused_ms), " ms")
     for name, q, most in (("health", 99, HEALTH_MS), ("healthz", 99, HEALTH_MS), ("late", 95, LATE_MS)):
         if attacked[name] or name != "late":

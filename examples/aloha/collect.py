@@ -12,13 +12,13 @@ back. Seeds begin at 0; evaluation takes others.
 
 import argparse
 import multiprocessing
-import os
 from pathlib import Path
 
 import numpy as np
 from expert import Expert
 
 from vla_cpp.eval.environments import make
+from vla_cpp.eval.environments.aloha import HEIGHT, WIDTH
 
 STEPS, EVERY = 230, 5
 NOISE, KEEPS = 0.008, 0.9  # radians that are drawn in a step; the share of a step's noise that stays in the next
@@ -31,7 +31,7 @@ def episode(environment, seed):
     seen, actions, solved, noise = [], [], False, np.zeros(14)
     for step in range(STEPS):
         if step % EVERY == 0:
-            seen.append((environment.drawn(96, 128), environment.state(), step, environment.cube()))
+            seen.append((environment.drawn(HEIGHT, WIDTH), environment.state(), step, environment.cube()))
         action = expert()
         noise = KEEPS * noise + random.normal(0, NOISE, 14)
         noise[[6, 13]] = 0  # grippers
@@ -53,7 +53,7 @@ def collect(job):
         print(f"seed {seed}: {len(actions)} episodes, {len(seen)} frames" + ("" if found else ", this one failed"), flush=True)
     frames, states, steps, cubes = map(np.array, zip(*seen))
     np.savez(out, frames=frames, states=states, step=steps.astype(np.int32), cubes=cubes.astype(np.float32), episode=np.array(episodes, np.int32), actions=np.array(actions, np.float32))
-    os._exit(0)  # the renderer's thread has no other end
+    environment.close()
 
 
 def main():

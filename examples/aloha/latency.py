@@ -10,8 +10,8 @@ the Wilson interval, median steps of those, and the share of periods without a n
 """
 
 import argparse
+import math
 import multiprocessing
-import os
 import subprocess
 
 import numpy as np
@@ -42,7 +42,7 @@ class Loop:
         if not line:
             raise SystemExit("the loop ended")
         seconds, state, *values = line.split()
-        waited = int(round((float(seconds) - begun) * RATE_HZ + 0.49)) if float(seconds) > begun + 1e-6 else 0
+        waited = math.ceil((float(seconds) - begun) * RATE_HZ - 1e-6)  # whole periods, but for the clock's rounding
         self._now = begun + (waited + 1) / RATE_HZ
         return np.array(values, np.float32) if values else None, waited, state == b"command"
 
@@ -76,10 +76,8 @@ def work(job):
     loop = Loop(options.loop, address, mode, latency)
     for seed in seeds:
         results.put(episode(environment, loop, seed))
+    environment.close()
     results.put(None)
-    results.close()
-    results.join_thread()
-    os._exit(0)  # the renderer's thread has no other end
 
 
 def measure(options, address, mode, ms):

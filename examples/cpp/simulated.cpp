@@ -12,9 +12,11 @@
 #include <algorithm>
 #include <cstdio>
 #include <iostream>
+#include <optional>
 #include <span>
 #include <sstream>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "vla/control.h"
@@ -49,6 +51,23 @@ class LatePolicy : public Policy {
   double latency_, due_ = 0;
 };
 
+/// Asks for a frame. Returns its width and height; its RGB bytes go to `pixels`.
+std::pair<int, int> read_frame(std::string& pixels) {
+  constexpr int kMost = 8192;
+  std::cout << "look" << std::endl;
+  std::string line;
+  std::getline(std::cin, line);
+  std::istringstream size(line);
+  int width = 0, height = 0;
+  size >> width >> height;
+  if (std::min(width, height) <= 0 || std::max(width, height) > kMost)
+    throw Error("usage", "frame", "WIDTH HEIGHT, of at most " + std::to_string(kMost), line);
+  pixels.resize(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3);
+  if (!std::cin.read(pixels.data(), static_cast<std::streamsize>(pixels.size())))
+    throw Error("usage", "frame", std::to_string(pixels.size()) + " bytes", std::to_string(std::cin.gcount()));
+  return {width, height};
+}
+
 const char* name_of(const Action& action) {
   if (action.problem != nullptr) throw Error(action.problem->code, "act", "a chunk", action.problem->message);
   return action.state == ActionState::command ? "command" : action.state == ActionState::held ? "held" : "none";
@@ -57,8 +76,11 @@ const char* name_of(const Action& action) {
 void run(char** argv) {
   const std::string view = argv[2], state = argv[3], text = argv[4], mode = argv[5];
   if (mode != "sync" && mode != "async") throw Error("usage", "mode", "sync or async", mode);
+  double latency = 0;
+  std::istringstream given(argv[6]);
+  if (!(given >> latency) || !given.eof() || latency < 0) throw Error("usage", "latency", "seconds", argv[6]);
   Client client(argv[1]);
-  LatePolicy policy(client, std::stod(argv[6]));
+  LatePolicy policy(client, latency);
   LoopOptions options;
   options.mode = mode == "sync" ? Mode::sync : Mode::async;
   options.blend = Blend::linear(4), options.late = Late::hold, options.on_note = OnNote::ignore;
@@ -66,20 +88,15 @@ void run(char** argv) {
   ChunkLoop loop(policy, options);
   std::vector<float> joints;
   std::string pixels;
+  std::optional<Error> refused;  // of a frame: `step` must not be left by an exception
   const auto look = [&](Observation& observation) {
-    std::cout << "look" << std::endl;
-    std::string line;
-    std::getline(std::cin, line);
-    std::istringstream size(line);
-    int width = 0, height = 0;
-    size >> width >> height;
-    if (width <= 0 || height <= 0) throw Error("usage", "frame", "WIDTH HEIGHT", line);
-    pixels.resize(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3);
-    std::cin.read(pixels.data(), static_cast<std::streamsize>(pixels.size()));
-    observation.frames = {{view, width, height, std::as_bytes(std::span(pixels))}};
-    observation.states = {{state, joints}};
-    observation.text = text;
-    observation.seed = 0;
+    observation.states = {{state, joints}}, observation.text = text, observation.seed = 0;
+    try {
+      const auto [width, height] = read_frame(pixels);
+      observation.frames = {{view, width, height, std::as_bytes(std::span(pixels))}};
+    } catch (const Error& error) {
+      refused = error;
+    }
   };
   for (std::string line; std::getline(std::cin, line);) {
     if (line == "reset") {
@@ -94,7 +111,9 @@ void run(char** argv) {
     policy.now = std::max(policy.now, seconds);
     joints.clear();
     for (float value; fields >> value;) joints.push_back(value);
+    if (!fields.eof()) throw Error("usage", "state", "numbers", line);
     const Action action = loop.step(look);
+    if (refused) throw *refused;
     std::cout << policy.now << ' ' << name_of(action);
     for (const float value : action.values) std::cout << ' ' << value;
     std::cout << std::endl;

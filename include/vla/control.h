@@ -332,8 +332,9 @@ class ChunkLoop {
   void start_at(std::span<const double> values);
   /// Waits for a first chunk. Errors: all that the policy answers.
   void begin(const Observe& observe);
-  /// One control period. `observe` is called only when an observation is wanted. `human`: of the person who drives, one
-  /// number for each action, within the limits; without it, while a person drives, the command is what `late` says.
+  /// One control period. `observe` is called only when an observation is wanted, and must not throw. `human`: of the
+  /// person who drives, one number for each action, within the limits; without it, while a person drives, the command
+  /// is what `late` says.
   Action step(const Observe& observe, std::span<const float> human = {}) noexcept;
   /// A person drives from now on. The policy is still asked, and Action::policy is what it wanted. Errors: usage, where
   /// another person drives.

@@ -25,7 +25,7 @@ def report(vla):
 
 @pytest.fixture
 def timed(vla):
-    """The program, where its times are those of its kernels."""
+    """The program. Skips under a sanitizer, which measures itself."""
     if vla.is_sanitized():
         pytest.skip("a sanitizer slows the kernels down")
     return vla

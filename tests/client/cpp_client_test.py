@@ -239,5 +239,12 @@ def test_the_loop_of_a_simulator_gets_its_chunks_as_late_as_it_says(faulty, tmp_
         process.stdin.close()
         assert process.wait(SECONDS) == 0
         process.stdout.close()
-    refused = subprocess.run([*arguments, "rtc", "0.1"], capture_output=True, text=True, timeout=SECONDS)
-    assert refused.returncode == 1 and "expected sync or async, found rtc" in refused.stderr
+    for given, sent, told in (
+        (["rtc", "0.1"], "", "expected sync or async, found rtc"),
+        (["sync", "soon"], "", "latency: expected seconds, found soon"),
+        (["sync", "0"], "step 0 1 nan", "state: expected numbers, found step 0 1 nan"),
+        (["sync", "0"], "step 0 1 2\n4 4\nabc", "frame: expected 48 bytes, found 3"),
+        (["sync", "0"], "step 0 1 2\n4 99999\nabc", "frame: expected WIDTH HEIGHT, of at most 8192, found 4 99999"),
+    ):
+        refused = subprocess.run([*arguments, *given], input=sent, capture_output=True, text=True, timeout=SECONDS)
+        assert refused.returncode == 1 and told in refused.stderr, refused.stderr

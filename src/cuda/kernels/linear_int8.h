@@ -19,9 +19,9 @@ namespace vla::cuda {
 /// ternary: 512 bytes; a word for every eight columns, 16 bytes of each lane. Byte b of it has a code plus 1 in two
 /// bits for each fragment, the first in the lowest, so that a shift by 2 s and a mask make the register. The 1 adds the
 /// row's sum of codes to every product, and comes off at the end.
-/// int4: 1056 bytes; two words for every eight columns, 16 bytes of each lane for every sixteen. Byte b of the first
-/// has the stored codes of fragments 0 and 1, the lower four bits first, and of the second those of 2 and 3. Then the
-/// steps of the columns (Int4Block), a word with that of column i of each eight for i from 0 to 7.
+/// int4: 1056 bytes. For every sixteen columns a lane has 16 bytes, two words for each eight of them. Byte b of the
+/// first word holds the codes of fragments 0 and 1, the lower four bits first; the second word holds those of 2 and 3.
+/// The columns' steps (Int4Block) follow: word i, from 0 to 7, holds the steps of column i of each eight.
 struct Int8Tile {
   static constexpr int kColumns = 32, kDepth = 64;
 };
@@ -92,7 +92,7 @@ constexpr int kHopperInt8Depth = 128;  // step of the depth, and unit of a split
 /// Shared memory holds a few stages of rows of x and of packed codes, three of codes in rows, and at last the sums.
 constexpr int kHopperInt8Stages = 4, kHopperCodeStages = 3;
 constexpr int hopper_int8_stage_bytes(CodeKind kind, int columns, int rows) {
-  return rows * kHopperInt8Depth + columns * kHopperInt8Depth / (kind == CodeKind::ternary ? 4 : 1);
+  return rows * kHopperInt8Depth + columns * column_bytes(kind) * (kHopperInt8Depth / Int8Tile::kDepth);
 }
 constexpr int hopper_int8_shared(CodeKind kind, int columns, int rows) {
   const int stages = kHopperInt8Stages * hopper_int8_stage_bytes(kind, columns, rows);

@@ -7,7 +7,7 @@
 
 namespace vla::cuda {
 
-/// A lane's codes of a packed tile (Int8Tile), a column of each eight.
+/// The codes of a packed tile (Int8Tile) that a lane owns: one column of every eight.
 template <CodeKind kKind>
 class LaneCodes {
  public:
@@ -23,7 +23,7 @@ class LaneCodes {
     }
     if constexpr (kKind == CodeKind::int4) steps_ = read(0U, kWords * 128 + lane / 4 * 4);
   }
-  /// A register of signed bytes; of ternary ones, plus 1.
+  /// Four codes as signed bytes; ternary ones plus 1.
   VLA_DEVICE unsigned fragment(int eight, int i) const {
     if constexpr (kKind == CodeKind::ternary) return words_[eight] >> 2 * i & 0x03030303U;
     if constexpr (kKind == CodeKind::int4) {

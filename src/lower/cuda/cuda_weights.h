@@ -22,7 +22,7 @@ constexpr cuda::CodeKind code_kind(MatrixKind kind) {
 }
 static_assert(code_kind(MatrixKind::int8) == cuda::CodeKind::int8);
 
-/// As in `linear_bf16`, of which the kernels' names are made.
+/// What the names of its kernels begin with: `linear_bf16`.
 std::string kernel_name(MatrixKind kind);
 
 /// A parameter's address and layout on the device: vectors and float32 matrices as float32, tables as stored, other

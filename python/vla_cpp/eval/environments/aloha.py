@@ -102,6 +102,9 @@ class Aloha(Environment):
         self.reward = max(self.reward, self._cube.get_reward(self.physics))
         return self.reward == SOLVED
 
+    def close(self) -> None:
+        self.physics.free()  # the renderer too, whose thread would otherwise complain at the end of the process
+
     def facts(self) -> Dict[str, float]:
         """What a row of results tells about the end of an episode beside success: 1 touched by the right gripper, 2 lifted, 3 touched
         by the left one, 4 handed over."""
