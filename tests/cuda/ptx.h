@@ -72,7 +72,7 @@ class PtxModule {
 /// Runs all blocks, one after the other. Throws Fault.
 void run_ptx(const PtxKernel& kernel, Extent grid, unsigned n_thread, std::size_t shared, const void* job);
 
-// Between the two halves, ptx_parse.cpp and ptx_run.cpp.
+// Between ptx_parse.cpp and ptx_instructions.cpp.
 
 constexpr const char* kSpecials[] = {"%tid.x",    "%ctaid.x",  "%ctaid.y",  "%ctaid.z", "%ntid.x",
                                      "%nctaid.x", "%nctaid.y", "%nctaid.z", "%laneid"};

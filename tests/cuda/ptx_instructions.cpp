@@ -1,0 +1,464 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <bit>
+#include <cfenv>
+#include <cmath>
+#include <cstring>
+#include <unordered_map>
+
+#include "cuda/fault.h"
+#include "cuda/fragments.h"
+#include "cuda/ptx_warp.h"
+
+namespace vla::test::cuda {
+
+u64 release_time = 1;
+namespace {
+
+template <class F>
+void each_lane(u32 active, F f) {
+  if (active == kAll)
+    for (int l = 0; l < kWarp; ++l) f(l);
+  else
+    for (; active != 0; active &= active - 1) f(std::countr_zero(active));
+}
+
+/// A result as a GPU leaves it: its NaN has bits of its own.
+template <class To>
+To result(To x) {
+  if constexpr (std::is_same_v<To, float>)
+    if (std::isnan(x)) return std::bit_cast<float>(0x7fffffff);
+  return x;
+}
+/// An operation lane by lane; kF has no state.
+template <auto kF, class To, class... From>
+void lanes(WarpState& w, const PtxInstruction& i) {
+  [&]<std::size_t... kI>(std::index_sequence<kI...>) {
+    To* to = w.lanes<To>(i.operand[0]);
+    [&](const auto*... from) {
+      each_lane(w.active, [&](int l) { to[l] = result<To>(kF(from[l]...)); });
+    }(w.lanes<From>(i.operand[kI + 1])...);
+  }
+  (std::index_sequence_for<From...>{});
+}
+template <auto kF, class T>
+void compare(WarpState& w, const PtxInstruction& i) {
+  const T *a = w.lanes<T>(i.operand[1]), *b = w.lanes<T>(i.operand[2]);
+  u32 bits = 0;
+  for (int l = 0; l < kWarp; ++l) bits |= static_cast<u32>(kF(a[l], b[l])) << l;
+  u32& to = w.mask(i.operand[0]);
+  to = (to & ~w.active) | (bits & w.active);
+}
+template <auto kF>
+void masks(WarpState& w, const PtxInstruction& i) {
+  u32& to = w.mask(i.operand[0]);
+  const u32 a = w.mask(i.operand[1]), b = i.n_operand > 2 ? w.mask(i.operand[2]) : 0;
+  to = (to & ~w.active) | (kF(a, b) & w.active);
+}
+template <class T>
+void select(WarpState& w, const PtxInstruction& i) {
+  const T *a = w.lanes<T>(i.operand[1]), *b = w.lanes<T>(i.operand[2]);
+  T* to = w.lanes<T>(i.operand[0]);
+  const u32 mask = w.mask(i.operand[3]);
+  each_lane(w.active, [&](int l) { to[l] = mask >> l & 1 ? a[l] : b[l]; });
+}
+
+// Memory
+
+[[noreturn]] void fault_at(const WarpState& w, const PtxInstruction& i, int lane, const char* what) {
+  throw Fault("thread " + std::to_string(w.thread(lane)) + ": " + what + ": " + i.text);
+}
+template <class F>
+void guarded(const WarpState& w, const PtxInstruction& i, const int& lane, F access) {
+  try {
+    access();
+  } catch (const Fault& problem) {
+    fault_at(w, i, lane, problem.what());
+  }
+}
+
+DeviceMemory::Allocation* fresh_hint(const PtxInstruction& i) {
+  if (i.hint_time != release_time) i.hint = nullptr, i.hint_time = release_time;
+  return i.hint;
+}
+
+std::byte* global(WarpState& w, const PtxInstruction& i, int which, int lane, std::size_t size, bool writes) {
+  const u64 p = w.lanes<u64>(i.operand[which])[lane] + static_cast<u64>(i.offset[which]);
+  guarded(w, i, lane, [&] { i.hint = device_memory().check(p, size, writes, fresh_hint(i)); });
+  if (w.early >> lane & 1 && (writes || device_memory().has_result(*i.hint, p, size)))
+    fault_at(w, i, lane, "does not wait for earlier kernels");
+  return reinterpret_cast<std::byte*>(p);
+}
+std::size_t in_shared(WarpState& w, const PtxInstruction& i, int lane) {
+  return static_cast<u32>(w.lanes<u32>(i.operand[0])[lane] + static_cast<u32>(i.offset[0]));
+}
+
+void load_value(WarpState& w, const PtxInstruction& i, int lane, const std::byte* from) {
+  if (i.width == 4 && !i.wide_value) {  // by far the most
+    for (int k = 0; k < i.count; ++k) std::memcpy(&w.lanes<u32>(i.operand[k + 1])[lane], from + 4 * k, 4);
+    return;
+  }
+  for (int k = 0; k < i.count; ++k, from += i.width) {
+    u64 value = 0;
+    std::memcpy(&value, from, static_cast<std::size_t>(i.width));
+    const int unused = 64 - 8 * i.width;
+    if (i.sign) value = static_cast<u64>(static_cast<i64>(value << unused) >> unused);
+    const u32 place = i.operand[k + 1];
+    i.wide_value ? void(w.lanes<u64>(place)[lane] = value) : void(w.lanes<u32>(place)[lane] = static_cast<u32>(value));
+  }
+}
+void store_value(WarpState& w, const PtxInstruction& i, int lane, std::byte* to) {
+  if (i.width == 4 && !i.wide_value) {
+    for (int k = 0; k < i.count; ++k) std::memcpy(to + 4 * k, &w.lanes<u32>(i.operand[k + 1])[lane], 4);
+    return;
+  }
+  for (int k = 0; k < i.count; ++k, to += i.width) {
+    const u32 place = i.operand[k + 1];
+    const void* from = i.wide_value ? static_cast<void*>(&w.lanes<u64>(place)[lane]) : &w.lanes<u32>(place)[lane];
+    std::memcpy(to, from, static_cast<std::size_t>(i.width));
+  }
+}
+std::size_t access_size(const PtxInstruction& i) { return static_cast<std::size_t>(i.width * i.count); }
+
+void load_param(WarpState& w, const PtxInstruction& i) {
+  each_lane(w.active, [&](int l) {
+    const u64 base = i.wide_address ? w.lanes<u64>(i.operand[0])[l] : w.lanes<u32>(i.operand[0])[l];
+    const u64 at = base + static_cast<u64>(i.offset[0]);
+    if (at + access_size(i) > w.job_size) fault_at(w, i, l, "reads behind the parameter");
+    load_value(w, i, l, w.job + at);
+  });
+}
+void load_global(WarpState& w, const PtxInstruction& i) {
+  each_lane(w.active, [&](int l) { load_value(w, i, l, global(w, i, 0, l, access_size(i), false)); });
+}
+void store_global(WarpState& w, const PtxInstruction& i) {
+  each_lane(w.active, [&](int l) { store_value(w, i, l, global(w, i, 0, l, access_size(i), true)); });
+}
+template <bool kWrites>
+void access_shared(WarpState& w, const PtxInstruction& i) {
+  std::size_t offsets[kWarp];
+  std::fill(offsets, offsets + kWarp, SharedMemory::kNone);
+  const std::size_t size = access_size(i);
+  int lane = 0;
+  guarded(w, i, lane, [&] {
+    each_lane(w.active, [&](int l) {
+      lane = l;
+      const std::size_t at = offsets[l] = in_shared(w, i, l);
+      kWrites ? w.shared->write(at, size, w.thread(l)) : w.shared->read(at, size, w.thread(l));
+      kWrites ? store_value(w, i, l, w.shared->data() + at) : load_value(w, i, l, w.shared->data() + at);
+    });
+  });
+  SharedMemory::count_conflicts(offsets, size);
+}
+void copy_async(WarpState& w, const PtxInstruction& i) {
+  const u32* bytes = w.lanes<u32>(i.operand[2]);
+  const u32* sizes = w.lanes<u32>(i.operand[3]);
+  each_lane(w.active, [&](int l) {
+    if (bytes[l] != 16) fault_at(w, i, l, "an asynchronous copy that is not of 16 bytes");
+    const std::byte* from = nullptr;
+    if (sizes[l] != 0) {  // what is read must be there, and its address aligned to all 16
+      from = reinterpret_cast<std::byte*>(w.lanes<u64>(i.operand[1])[l] + static_cast<u64>(i.offset[1]));
+      const auto at = reinterpret_cast<std::uintptr_t>(from);
+      if (at % 16 != 0) fault_at(w, i, l, "source of an asynchronous copy is not aligned");
+      for (u32 b = 0, step = sizes[l] == 16 ? 16 : 1; b < sizes[l]; b += step)
+        guarded(w, i, l, [&] { i.hint = device_memory().check(at + b, step, false, fresh_hint(i)); });
+      if (w.early >> l & 1 && device_memory().has_result(*i.hint, at, sizes[l]))
+        fault_at(w, i, l, "does not wait for earlier kernels");
+    }
+    guarded(w, i, l, [&] { w.shared->copy(in_shared(w, i, l), from, sizes[l], w.thread(l)); });
+  });
+}
+
+// All lanes together
+
+template <bool kTransposed>
+void matrices(WarpState& w, const PtxInstruction& i) {
+  std::size_t rows[kWarp];
+  const u32* at = w.lanes<u32>(i.operand[4]);
+  for (int l = 0; l < kWarp; ++l) rows[l] = static_cast<u32>(at[l] + static_cast<u32>(i.offset[0]));
+  Lanes to[4];
+  guarded(w, i, 0, [&] { load_matrices(to, rows, kTransposed, *w.shared, w.number); });
+  for (int r = 0; r < 4; ++r) std::memcpy(w.lanes<u32>(i.operand[r]), to[r], sizeof(Lanes));
+}
+template <auto kMultiply>
+void multiply(WarpState& w, const PtxInstruction& i) {
+  Lanes in[10], to[4];  // a, b, sum
+  for (int r = 0; r < 10; ++r) std::memcpy(in[r], w.lanes<u32>(i.operand[4 + r]), sizeof(Lanes));
+  kMultiply(to, in, in + 4, in + 6);
+  for (int r = 0; r < 4; ++r) std::memcpy(w.lanes<u32>(i.operand[r]), to[r], sizeof(Lanes));
+}
+/// Operands: to, a predicate that nobody reads, value, lane or mask, the bounds of a whole warp, membership of all.
+template <bool kXor>
+void shuffle(WarpState& w, const PtxInstruction& i) {
+  const u32 *value = w.lanes<u32>(i.operand[2]), *which = w.lanes<u32>(i.operand[3]);
+  u32 to[kWarp];
+  for (int l = 0; l < kWarp; ++l) {
+    if (w.lanes<u32>(i.operand[4])[l] != 31 || w.lanes<u32>(i.operand[5])[l] != kAll)
+      fault_at(w, i, l, "a shuffle of a part of a warp");
+    to[l] = value[kXor ? l ^ static_cast<int>(which[l] & 31) : static_cast<int>(which[l] & 31)];
+  }
+  std::memcpy(w.lanes<u32>(i.operand[0]), to, sizeof(to));
+}
+/// Takes the sums over from registers, unless they are in flight already.
+void wgmma(WarpState& w, const PtxInstruction& i) {
+  WgmmaProduct product = i.product;
+  product.a = w.lanes<u64>(i.operand[0])[0], product.b = w.lanes<u64>(i.operand[1])[0];
+  const u32 adds = w.mask(i.operand[2]);
+  for (int l = 0; l < kWarp; ++l)
+    if (w.lanes<u64>(i.operand[0])[l] != product.a || w.lanes<u64>(i.operand[1])[l] != product.b)
+      fault_at(w, i, l, "lanes of a warp issue different products");
+  if (adds != 0 && adds != kAll) fault_at(w, i, 0, "lanes of a warp issue different products");
+  product.adds = adds != 0;
+  const auto first = w.in_flight.find(i.sums[0]);
+  WgmmaSums* sums = first == w.in_flight.end() ? nullptr : first->second.first;
+  if (sums == nullptr) sums = &w.sums.emplace_back();
+  sums->of.resize(i.sums.size());
+  for (std::size_t r = 0; r < i.sums.size(); ++r) {
+    const auto [at, is_new] = w.in_flight.try_emplace(i.sums[r], sums, r);
+    if (is_new && sums->n_product == 0) std::memcpy(&sums->of[r], w.lanes<u32>(i.sums[r]), sizeof(Lanes));
+    if (at->second != std::pair{sums, r} || (is_new && sums->n_product != 0))
+      fault_at(w, i, 0, "sums of different products");
+  }
+  guarded(w, i, 0, [&] { w.wgmma.issue(product, *sums); });
+}
+void wgmma_wait(WarpState& w, const PtxInstruction& i) {
+  guarded(w, i, 0, [&] { w.wgmma.wait(w.lanes<u32>(i.operand[0])[0]); });
+  for (const auto& [place, sum] : w.in_flight)
+    if (sum.first->n_product == 0) std::memcpy(w.lanes<u32>(place), &sum.first->of[sum.second], sizeof(Lanes));
+  std::erase_if(w.in_flight, [](const auto& one) { return one.second.first->n_product == 0; });
+  std::erase_if(w.sums, [](const WgmmaSums& sums) { return sums.n_product == 0; });
+}
+void warp_barrier(WarpState& w, const PtxInstruction&) { w.shared->warp_barrier(w.number); }
+
+float fma_down(float a, float b, float c) {
+  const int before = std::fegetround();
+  std::fesetround(FE_DOWNWARD);
+  volatile float x = a, y = b, z = c;
+  volatile float sum = std::fma(x, y, z);
+  std::fesetround(before);
+  return sum;
+}
+i32 to_int(float x) {  // to the nearest, ties to even; saturating, NaN to 0
+  if (std::isnan(x)) return 0;
+  return static_cast<i32>(std::clamp(std::nearbyint(static_cast<double>(x)), -2147483648.0, 2147483647.0));
+}
+float saturate(float x) { return std::isnan(x) ? 0 : std::fmin(std::fmax(x, 0.0f), 1.0f); }
+
+/// Four bytes of a and b, each chosen by a digit, whose highest bit asks for the sign.
+u32 permute(u32 a, u32 b, u32 digits) {
+  const u64 both = static_cast<u64>(b) << 32 | a;
+  u32 to = 0;
+  for (int i = 0; i < 4; ++i) {
+    const u32 digit = digits >> 4 * i & 15, byte = static_cast<u32>(both >> 8 * (digit & 7)) & 0xff;
+    to |= (digit & 8 ? (byte & 0x80 ? 0xff : 0) : byte) << 8 * i;
+  }
+  return to;
+}
+
+#define ONE(To, A, ...) lanes<([](A a) -> To { return __VA_ARGS__; }), To, A>
+#define TWO(To, T, ...) lanes<([](T a, T b) -> To { return __VA_ARGS__; }), To, T, T>
+#define THREE(To, T, ...) lanes<([](T a, T b, T c) -> To { return __VA_ARGS__; }), To, T, T, T>
+#define COMPARE(T, ...) compare<([](T a, T b) -> bool { return __VA_ARGS__; }), T>
+#define COMPARISONS(type, operands, T)                                                                 \
+  {"setp.eq." type, operands, COMPARE(T, a == b)}, {"setp.ne." type, operands, COMPARE(T, a != b)},    \
+      {"setp.lt." type, operands, COMPARE(T, a < b)}, {"setp.le." type, operands, COMPARE(T, a <= b)}, \
+      {"setp.gt." type, operands, COMPARE(T, a > b)}, {                                                \
+    "setp.ge." type, operands, COMPARE(T, a >= b)                                                      \
+  }
+
+const PtxOperation kOperations[] = {
+    {"add.s32", "ddd", TWO(u32, u32, a + b)},
+    {"add.s64", "qqq", TWO(u64, u64, a + b)},
+    {"sub.s32", "ddd", TWO(u32, u32, a - b)},
+    {"sub.s64", "qqq", TWO(u64, u64, a - b)},
+    {"mul.lo.s32", "ddd", TWO(u32, u32, a* b)},
+    {"mul.lo.s64", "qqq", TWO(u64, u64, a* b)},
+    {"mul.wide.s32", "qdd", TWO(i64, i32, static_cast<i64>(a) * b)},
+    {"mul.wide.u32", "qdd", TWO(u64, u32, static_cast<u64>(a) * b)},
+    {"mul.hi.s32", "ddd", TWO(u32, i32, static_cast<u32>(static_cast<u64>(static_cast<i64>(a) * b) >> 32))},
+    {"mul.hi.u32", "ddd", TWO(u32, u32, static_cast<u32>(static_cast<u64>(a) * b >> 32))},
+    {"mad.lo.s32", "dddd", THREE(u32, u32, a* b + c)},
+    {"mad.lo.s64", "qqqq", THREE(u64, u64, a* b + c)},
+    {"mad.wide.s32", "qddq",
+     lanes<([](i32 a, i32 b, i64 c) -> i64 { return static_cast<i64>(a) * b + c; }), i64, i32, i32, i64>},
+    {"mad.wide.u32", "qddq",
+     lanes<([](u32 a, u32 b, u64 c) -> u64 { return static_cast<u64>(a) * b + c; }), u64, u32, u32, u64>},
+    {"div.s32", "ddd", TWO(i32, i32, b == 0 ? -1 : static_cast<i32>(static_cast<i64>(a) / b))},
+    {"div.u32", "ddd", TWO(u32, u32, b == 0 ? ~u32{0} : a / b)},
+    {"div.s64", "qqq", TWO(i64, i64, b == 0 ? -1 : a / b)},
+    {"div.u64", "qqq", TWO(u64, u64, b == 0 ? ~u64{0} : a / b)},
+    {"rem.s32", "ddd", TWO(i32, i32, b == 0 ? a : static_cast<i32>(static_cast<i64>(a) % b))},
+    {"rem.u32", "ddd", TWO(u32, u32, b == 0 ? a : a % b)},
+    {"rem.s64", "qqq", TWO(i64, i64, b == 0 ? a : a % b)},
+    {"rem.u64", "qqq", TWO(u64, u64, b == 0 ? a : a % b)},
+    {"min.s32", "ddd", TWO(i32, i32, std::min(a, b))},
+    {"max.s32", "ddd", TWO(i32, i32, std::max(a, b))},
+    {"min.u32", "ddd", TWO(u32, u32, std::min(a, b))},
+    {"max.u32", "ddd", TWO(u32, u32, std::max(a, b))},
+    {"neg.s32", "dd", ONE(u32, u32, 0 - a)},
+    {"abs.s32", "dd", ONE(i32, i32, a < 0 ? -a : a)},
+    {"and.b32", "ddd", TWO(u32, u32, a& b)},
+    {"or.b32", "ddd", TWO(u32, u32, a | b)},
+    {"xor.b32", "ddd", TWO(u32, u32, a ^ b)},
+    {"not.b32", "dd", ONE(u32, u32, ~a)},
+    {"and.b64", "qqq", TWO(u64, u64, a& b)},
+    {"or.b64", "qqq", TWO(u64, u64, a | b)},
+    {"and.b16", "ddd", TWO(u32, u32, a& b)},
+    {"or.b16", "ddd", TWO(u32, u32, a | b)},
+    {"shl.b32", "ddd", TWO(u32, u32, b > 31 ? 0 : a << b)},
+    {"shr.u32", "ddd", TWO(u32, u32, b > 31 ? 0 : a >> b)},
+    {"shr.s32", "ddd", lanes<([](i32 a, u32 b) -> i32 { return a >> std::min(b, 31U); }), i32, i32, u32>},
+    {"shl.b64", "qqd", lanes<([](u64 a, u32 b) -> u64 { return b > 63 ? 0 : a << b; }), u64, u64, u32>},
+    {"shr.u64", "qqd", lanes<([](u64 a, u32 b) -> u64 { return b > 63 ? 0 : a >> b; }), u64, u64, u32>},
+    {"shr.s64", "qqd", lanes<([](i64 a, u32 b) -> i64 { return a >> std::min(b, 63U); }), i64, i64, u32>},
+    {"shl.b16", "ddd", TWO(u32, u32, b > 15 ? 0 : a << b & 0xffff)},
+    {"mov.u32", "dd", ONE(u32, u32, a)},
+    {"mov.b32", "dd", ONE(u32, u32, a)},
+    {"mov.f32", "dd", ONE(u32, u32, a)},
+    {"mov.u16", "dd", ONE(u32, u32, a)},
+    {"mov.b16", "dd", ONE(u32, u32, a)},
+    {"mov.u64", "qq", ONE(u64, u64, a)},
+    {"mov.b64", "qq", ONE(u64, u64, a)},
+    {"cvta.to.global.u64", "qq", ONE(u64, u64, a)},
+    {"selp.b32", "dddp", select<u32>},
+    {"selp.u32", "dddp", select<u32>},
+    {"selp.s32", "dddp", select<u32>},
+    {"selp.f32", "dddp", select<u32>},
+    {"selp.b16", "dddp", select<u32>},
+    {"selp.u16", "dddp", select<u32>},
+    {"selp.b64", "qqqp", select<u64>},
+    {"and.pred", "ppp", masks<([](u32 a, u32 b) { return a & b; })>},
+    {"or.pred", "ppp", masks<([](u32 a, u32 b) { return a | b; })>},
+    {"xor.pred", "ppp", masks<([](u32 a, u32 b) { return a ^ b; })>},
+    {"not.pred", "pp", masks<([](u32 a, u32) { return ~a; })>},
+    {"mov.pred", "pp", masks<([](u32 a, u32) { return a; })>},
+    COMPARISONS("s32", "pdd", i32),
+    COMPARISONS("u32", "pdd", u32),
+    COMPARISONS("f32", "pdd", float),
+    COMPARISONS("s64", "pqq", i64),
+    COMPARISONS("u64", "pqq", u64),
+    {"setp.ltu.f32", "pdd", COMPARE(float, !(a >= b))},
+    {"setp.leu.f32", "pdd", COMPARE(float, !(a > b))},
+    {"setp.gtu.f32", "pdd", COMPARE(float, !(a <= b))},
+    {"setp.geu.f32", "pdd", COMPARE(float, !(a < b))},
+    {"setp.neu.f32", "pdd", COMPARE(float, !(a == b))},
+    {"setp.nan.f32", "pdd", COMPARE(float, std::isnan(a) || std::isnan(b))},
+    {"setp.eq.s16", "pdd", COMPARE(u32, (a & 0xffff) == (b & 0xffff))},
+    {"setp.ne.s16", "pdd", COMPARE(u32, (a & 0xffff) != (b & 0xffff))},
+    {"setp.eq.b64", "pqq", COMPARE(u64, a == b)},
+    {"setp.eq.b32", "pdd", COMPARE(u32, a == b)},
+    {"setp.ne.b32", "pdd", COMPARE(u32, a != b)},
+    {"cvt.s64.s32", "qd", ONE(i64, i32, a)},
+    {"cvt.s64.s32 of 64 bits", "qq", ONE(i64, i64, static_cast<i32>(a))},
+    {"cvt.u64.u32", "qd", ONE(u64, u32, a)},
+    {"cvt.u32.u64", "dq", ONE(u32, u64, static_cast<u32>(a))},
+    {"cvt.u32.u16", "dd", ONE(u32, u32, a & 0xffff)},
+    {"cvt.u16.u32", "dd", ONE(u32, u32, a & 0xffff)},
+    {"cvt.s16.s8", "dd", ONE(u32, u32, static_cast<u32>(static_cast<std::int8_t>(a)) & 0xffff)},
+    {"cvt.s32.s8", "dd", ONE(i32, u32, static_cast<std::int8_t>(a))},
+    {"cvt.rn.f32.s32", "dd", ONE(float, i32, static_cast<float>(a))},
+    {"cvt.rn.f32.u32", "dd", ONE(float, u32, static_cast<float>(a))},
+    {"cvt.rni.s32.f32", "dd", ONE(i32, float, to_int(a))},
+    {"cvt.rzi.s32.f32", "dd", ONE(i32, float, to_int(std::trunc(a)))},
+    {"cvt.rmi.f32.f32", "dd", ONE(float, float, std::floor(a))},
+    {"cvt.sat.f32.f32", "dd", ONE(float, float, saturate(a))},
+    {"cvt.rn.bf16x2.f32", "ddd", TWO(u32, float, float_to_bf16(b) | float_to_bf16(a) << 16)},
+    {"cvt.f32.f16", "dd", ONE(float, u32, f16_to_float(a & 0xffff))},
+    {"prmt.b32", "dddd", THREE(u32, u32, permute(a, b, c))},
+    {"add.f32", "ddd", TWO(float, float, a + b)},
+    {"add.rn.f32", "ddd", TWO(float, float, a + b)},
+    {"sub.f32", "ddd", TWO(float, float, a - b)},
+    {"mul.f32", "ddd", TWO(float, float, a* b)},
+    {"mul.rn.f32", "ddd", TWO(float, float, a* b)},
+    {"div.rn.f32", "ddd", TWO(float, float, a / b)},
+    {"fma.rn.f32", "dddd", THREE(float, float, __builtin_fmaf(a, b, c))},
+    {"fma.rm.f32", "dddd", THREE(float, float, fma_down(a, b, c))},
+    {"neg.f32", "dd", ONE(float, float, -a)},
+    {"abs.f32", "dd", ONE(float, float, std::fabs(a))},
+    {"min.f32", "ddd", TWO(float, float, std::fmin(a, b))},
+    {"max.f32", "ddd", TWO(float, float, std::fmax(a, b))},
+    {"copysign.f32", "ddd", TWO(float, float, std::copysign(b, a))},
+    {"sqrt.rn.f32", "dd", ONE(float, float, std::sqrt(a))},
+    {"rcp.rn.f32", "dd", ONE(float, float, 1 / a)},
+    // Approximations: a GPU's differ from these in the last bits.
+    {"rcp.approx.ftz.f32", "dd", ONE(float, float, 1 / a)},
+    {"ex2.approx.ftz.f32", "dd", ONE(float, float, exp2f(a))},
+    {"setp.num.f32", "pdd", COMPARE(float, !std::isnan(a) && !std::isnan(b))},
+    {"setp.nan.f32", "pdd", COMPARE(float, std::isnan(a) || std::isnan(b))},
+    {"ex2.approx.f32", "dd", ONE(float, float, exp2f(a))},
+    {"dp4a.s32.s32", "dddd", THREE(u32, u32, static_cast<u32>(vla::cuda::dev::dot4(a, b, static_cast<int>(c))))},
+    {"cp.async.cg.shared.global", "sgdd", copy_async},
+    {"cp.async.commit_group", "",
+     [](WarpState& w, const PtxInstruction&) { each_lane(w.active, [&](int l) { w.shared->commit(w.thread(l)); }); }},
+    {"cp.async.wait_group", "d",
+     [](WarpState& w,
+        const PtxInstruction&
+            i) { each_lane(w.active, [&](int l) { w.shared->wait(w.lanes<u32>(i.operand[0])[l], w.thread(l)); }); }},
+    {"fence.proxy.async.shared::cta", "",
+     [](WarpState& w,
+        const PtxInstruction&) { each_lane(w.active, [&](int l) { w.shared->fence_async(w.thread(l)); }); }},
+    {"wgmma.fence.sync.aligned", "", [](WarpState& w, const PtxInstruction&) { w.wgmma.fence(); },
+     PtxInstruction::kWarp},
+    {"wgmma.commit_group.sync.aligned", "", [](WarpState& w, const PtxInstruction&) { w.wgmma.commit(); },
+     PtxInstruction::kWarp},
+    {"wgmma.wait_group.sync.aligned", "d", wgmma_wait, PtxInstruction::kWarp},
+    {"griddepcontrol.launch_dependents", "", [](WarpState&, const PtxInstruction&) {}},
+    {"griddepcontrol.wait", "", [](WarpState& w, const PtxInstruction&) { w.early &= ~w.active; }},
+    {"bar.sync", "d", nullptr, PtxInstruction::kBarrier},
+    {"bar.warp.sync", "d", warp_barrier, PtxInstruction::kWarp},
+    {"shfl.sync.bfly.b32", "dpdddd", shuffle<true>, PtxInstruction::kWarp},
+    {"shfl.sync.idx.b32", "dpdddd", shuffle<false>, PtxInstruction::kWarp},
+    {"ldmatrix.sync.aligned.m8n8.x4.shared.b16", "dddds", matrices<false>, PtxInstruction::kWarp},
+    {"ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16", "dddds", matrices<true>, PtxInstruction::kWarp},
+    {"mma.sync.aligned.m16n8k32.row.col.s32.s8.s8.s32", "dddddddddddddd", multiply<mma_s8>, PtxInstruction::kWarp},
+    {"mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32", "dddddddddddddd", multiply<mma_bf16>,
+     PtxInstruction::kWarp},
+};
+}  // namespace
+
+bool renames(WarpState& w, const PtxInstruction& i) {
+  const auto found = i.is_move ? w.in_flight.find(i.operand[1]) : w.in_flight.end();
+  if (i.is_move) w.in_flight.erase(i.operand[0]);
+  if (found != w.in_flight.end()) {
+    if (w.active != kAll) fault_at(w, i, 0, "touches sums of wgmma that it has not waited for");
+    const auto sum = found->second;
+    w.in_flight[i.operand[0]] = sum;
+    return true;
+  }
+  for (int k = 0; k < i.n_operand; ++k)
+    if (w.in_flight.contains(i.operand[k])) fault_at(w, i, 0, "touches sums of wgmma that it has not waited for");
+  return false;
+}
+
+const PtxOperation* find_operation(const std::string& name) {
+  static const std::unordered_map<std::string, PtxOperation> all = [] {
+    std::unordered_map<std::string, PtxOperation> table;
+    for (const PtxOperation& one : kOperations) table.emplace(one.name, one);
+    return table;
+  }();
+  const auto found = all.find(name);
+  return found == all.end() ? nullptr : &found->second;
+}
+
+void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, const PtxInstruction&) {
+  const std::string_view start = "wgmma.mma_async.sync.aligned.m64n";
+  if (name.compare(0, start.size(), start) != 0) return nullptr;
+  char* end = nullptr;
+  product.n = static_cast<int>(std::strtol(name.c_str() + start.size(), &end, 10));
+  const std::string_view shape = end;
+  if (product.n < 8 || product.n > 256 || product.n % 8 != 0) return nullptr;
+  if (shape != "k16.f32.bf16.bf16" && shape != "k32.s32.s8.s8") return nullptr;
+  product.kind = shape[1] == '1' ? WgmmaProduct::bf16 : WgmmaProduct::s8;
+  return wgmma;
+}
+
+void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&) {
+  const bool loads = operation == "ld";
+  if (space == "param" && loads) return load_param;
+  if (space == "global") return loads ? load_global : store_global;
+  if (space == "shared") return loads ? access_shared<false> : access_shared<true>;
+  return nullptr;
+}
+
+}  // namespace vla::test::cuda

@@ -1,0 +1,54 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <list>
+#include <map>
+#include <utility>
+#include <vector>
+
+#include "cuda/ptx.h"
+#include "cuda/wgmma.h"
+
+/// What instructions change (ptx_instructions.cpp), and who runs them reads (ptx_run.cpp).
+namespace vla::test::cuda {
+
+using u32 = std::uint32_t;
+using u64 = std::uint64_t;
+using i32 = std::int32_t;
+using i64 = std::int64_t;
+constexpr u32 kAll = ~u32{0};
+
+/// Grows with every launch: where an access went before may have been released.
+extern u64 release_time;
+
+/// A warp: its registers, and how far each lane is.
+struct WarpState {
+  std::vector<std::byte> registers;
+  u32 active = 0;        // lanes that do the instruction
+  u32 live = kAll;       // lanes that have not returned
+  u32 waits = 0;         // lanes at an instruction that all lanes do together
+  u32 early = 0;         // lanes that have not waited for earlier kernels yet
+  bool together = true;  // all lanes that live are at pc
+  int pc = 0, pcs[kWarp] = {};
+  int number = 0;
+  long n_done = 0;
+  const std::byte* job = nullptr;
+  std::size_t job_size = 0;
+  SharedMemory* shared = nullptr;
+  Wgmma wgmma;
+  std::list<WgmmaSums> sums;                                    // in flight
+  std::map<u32, std::pair<WgmmaSums*, std::size_t>> in_flight;  // registers of such sums
+
+  template <class T>
+  T* lanes(u32 place) {
+    return reinterpret_cast<T*>(&registers[place]);
+  }
+  u32& mask(u32 place) { return *lanes<u32>(place); }
+  int thread(int lane) const { return number * kWarp + lane; }
+};
+
+/// While sums are in flight, other instructions than wgmma may only rename their registers. Whether that was done.
+bool renames(WarpState& w, const PtxInstruction& i);
+
+}  // namespace vla::test::cuda
