@@ -16,7 +16,7 @@ inline float flush(float x) { return std::abs(x) < 0x1p-126f ? std::copysign(0.0
 inline float multiply_add(float a, float b, float c) { return flush(std::fma(flush(a), flush(b), flush(c))); }
 
 /// Numbers of `low` and then of `high` to the nearest bf16, ties to even; subnormal numbers are zero.
-inline __m512bh round_pairs(__m512 high, __m512 low) {
+VLA_CALLED __m512bh round_pairs(const __m512& high, const __m512& low) {
   std::uint16_t rounded[32];
   for (int i = 0; i < 32; ++i) {
     const float x = i < 16 ? low[i] : high[i - 16];
@@ -34,7 +34,8 @@ inline __m256bh round_half_as_many(__m512 x) {
 }
 
 /// sum += the products of both numbers of each pair.
-inline __m512 add_pairs(__m512 sum, __m512bh a, __m512bh b) {
+VLA_CALLED __m512 add_pairs(const __m512& before, const __m512bh& a, const __m512bh& b) {
+  __m512 sum = before;
   const auto words_a = std::bit_cast<std::array<std::uint32_t, 16>>(a);
   const auto words_b = std::bit_cast<std::array<std::uint32_t, 16>>(b);
   for (std::size_t i = 0; i < 16; ++i) {
