@@ -15,6 +15,10 @@ from server_process import SECONDS, Robot, Server  # noqa: E402
 import vla_cpp  # noqa: E402
 
 
+def pytest_configure(config):
+    config.addinivalue_line("markers", "alone: attackers and their victim, and what times acts, need the machine (tests/CMakeLists.txt)")
+
+
 @pytest.fixture
 def faulty():
     server = FaultyServer()

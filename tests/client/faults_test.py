@@ -20,6 +20,8 @@ from server_process import SECONDS, Robot, Server, frames
 import vla_cpp
 from vla_cpp import wire
 
+pytestmark = pytest.mark.alone
+
 LIMIT_MIB = 1  # of a message: enough for what is sent here, and quick to go over
 
 

@@ -10,6 +10,8 @@ from golden_cases import Golden
 from hostile_images import files, sizes
 from server_process import Server
 
+pytestmark = pytest.mark.alone
+
 MOST_SECONDS = 0.4  # of the processor: 0.2 s on a quiet machine, whose cores share nothing
 REFUSED_SECONDS = 0.1  # most of it is the receipt of 33 MB
 FAMILIES = "gr00t_n1_6/libero", "bitvla/one_view"  # images of any size; the first averages, the second filters

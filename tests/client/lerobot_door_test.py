@@ -24,6 +24,8 @@ from lerobot_calls import Peer, Robot  # noqa: E402
 from lerobot_pickles import TimedObservation, dumps, setup_of  # noqa: E402
 from server_process import SECONDS, VLA, frames  # noqa: E402
 
+pytestmark = pytest.mark.alone
+
 OTHER = "127.0.0.2"  # an address that is not the robots'
 DOOR = "vla-door-lerobot"
 CALL = "/transport.AsyncInference/GetActions"

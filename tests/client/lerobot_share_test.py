@@ -16,6 +16,8 @@ from lerobot_calls import Peer  # noqa: E402
 from lerobot_pickles import TimedObservation, dumps, setup_of  # noqa: E402
 from server_process import ROOT, frames  # noqa: E402
 
+pytestmark = pytest.mark.alone
+
 ROBOT, OTHER = "127.0.0.1", "127.0.0.2"
 
 

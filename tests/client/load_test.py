@@ -8,7 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from server_process import VLA
+
+pytestmark = pytest.mark.alone
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOL = os.environ.get("VLA_LOAD_TOOL", VLA.with_name("load_tool"))

@@ -18,6 +18,8 @@ from server_process import SECONDS, Robot, Server
 
 import vla_cpp
 
+pytestmark = pytest.mark.alone
+
 HEALTH = request("health")
 
 
