@@ -60,7 +60,8 @@ Status CpuDevice::load(const ParamList& params, bool fill, const WeightPlan& pla
 
 Result<WeightPlan> CpuDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
   const auto &first = static_cast<const CpuProgram&>(prefix), &then = static_cast<const CpuProgram&>(step);
-  return plan_streams({std::span(first.reads()).subspan(first.n_prepare()), then.reads(),
+  const std::span<const std::vector<OpMatrices>> reads = first.reads();
+  return plan_streams({reads.first(first.n_prepare()), reads.subspan(first.n_prepare()), then.reads(),
                        [&](const Param& matrix) { return weights_.size_of(matrix); }, weights_.size()},
                       size);
 }

@@ -53,7 +53,8 @@ Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan& pl
 
 Result<WeightPlan> CudaDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
   const auto &first = static_cast<const CudaProgram&>(prefix), &then = static_cast<const CudaProgram&>(step);
-  return plan_streams({std::span(first.reads()).subspan(first.n_prepare()), then.reads(),
+  const std::span<const std::vector<OpMatrices>> reads = first.reads();
+  return plan_streams({reads.first(first.n_prepare()), reads.subspan(first.n_prepare()), then.reads(),
                        [&](const Param& matrix) { return weights_.size_of(matrix); }, weights_.memory()->size()},
                       size);
 }

@@ -58,14 +58,18 @@ class Planner {
       for (const Param* matrix : phase) group_of[matrix] = groups_.size() - 1;
     }
     const std::size_t n_resident = resident_.size();
-    for (const auto& ops : use_.prefix)
-      for (const OpMatrices& op : ops) {
-        std::set<std::size_t> groups;
-        for (const Param* matrix : op)
-          if (const auto found = group_of.find(matrix); found != group_of.end()) groups.insert(found->second);
-        if (groups.size() > 1) resident_.insert(op.begin(), op.end());
-      }
+    for (const auto& part : {use_.prepare, use_.prefix})
+      for (const auto& ops : part)
+        for (const OpMatrices& op : ops)
+          if (reads_several(op, group_of)) resident_.insert(op.begin(), op.end());
     return resident_.size() == n_resident;
+  }
+
+  static bool reads_several(const OpMatrices& op, const std::map<const Param*, std::size_t>& group_of) {
+    std::set<std::size_t> groups;
+    for (const Param* matrix : op)
+      if (const auto found = group_of.find(matrix); found != group_of.end()) groups.insert(found->second);
+    return groups.size() > 1;
   }
 
   /// n of the groups.
