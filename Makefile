@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test soak check check-includes arm64 test-arm64 test-cuda test-vulkan build vulkan cuda gpu-kit wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
+.PHONY: help demo libero test soak check check-includes arm64 test-arm64 test-budgets test-cuda test-vulkan build vulkan cuda gpu-kit wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -166,6 +166,10 @@ test-vulkan: vulkan
 test-cuda: build
 	@scripts/cuda.sh .cache/nvcc nvcc
 	VLA_ALL_MISTAKES=1 VLA_ALL_FAMILIES=1 VLA_ALL_ARCHITECTURES=1 VLA_ALL_FAULTS=1 VLA_ALL_CASES=1 ctest --preset cpu -R '^cuda_' --output-on-failure
+
+# The least memory of all published policies in all dtypes and kernels, of which `make test` tries some: half an hour, 8 GB of memory.
+test-budgets: build
+	VLA_ALL_BUDGETS=1 $(PYTHON) scripts/check.py cli/least
 
 # Downloads 90 MB of Debian's libraries for ARM into .cache.
 SYSROOT := .cache/sysroot-arm64
