@@ -114,20 +114,22 @@ def print_blocks(program, folder, bundle, made):
     print("      " + ", ".join(f"{path} {error[path]:.2f} %" for path in (*last.values(), worst)), flush=True)
 
 
-def write_like(bundle, content, path, changed):
-    """A bundle with other values of some tensors, in its dtypes.  changed: {tensor: float32}."""
+def write_like(bundle, content, path, changed, has_floats=False):
+    """A bundle with other values of some tensors, in its dtypes, or in float32 where it has floats.  changed: {tensor: float32}."""
     from bundle_keys import bundle_keys
 
     from vla_cpp.convert.bundle import BundleWriter, TensorInfo
 
+    dtypes = {name: "f32" if has_floats and dtype == "bf16" else dtype for name, dtype in content.dtypes.items()}
+
     def stored(name, values):
         floats = np.ascontiguousarray(changed[name], np.float32) if name in changed else values
-        if name not in changed or content.dtypes[name] == "f32":
+        if name not in changed or dtypes[name] == "f32":
             return floats
         bits = floats.view(np.uint32).astype(np.uint64)
         return ((bits + 0x7FFF + (bits >> 16 & 1)) >> 16).astype(np.uint16)
 
-    tensors = [TensorInfo(name, values.shape, content.dtypes[name]) for name, values in content.tensors.items()]
+    tensors = [TensorInfo(name, values.shape, dtypes[name]) for name, values in content.tensors.items()]
     with BundleWriter(str(path), bundle_keys(bundle), tensors) as out:
         for name, values in content.tensors.items():
             out.write(name, stored(name, values))
@@ -205,6 +207,19 @@ class Planter:
         return places
 
 
+def rotate(bundle, path, observation):
+    """The same policy in float32, its channels rotated."""
+    from rotated import rotated_tensors
+
+    from vla_cpp.convert.bundle import read_bundle
+
+    content = read_bundle(str(bundle))
+    write_like(bundle, content, path, rotated_tensors(content), has_floats=True)
+    expected, got = (chunks(one, [observation], "float32") for one in (bundle, path))
+    print(f"rotated: the chunk moves by {np.abs(got - expected).max() / np.abs(expected).max():.1e} of its largest element", flush=True)
+    return path
+
+
 def record(bundle, folder, observations):
     from server_process import SECONDS, Server
 
@@ -254,6 +269,7 @@ def main():
     parser.add_argument("--packages", help="folder of the packages that tools/trained_parts.py names")
     parser.add_argument("--every", type=int, default=23, help="distance of planted channels")
     parser.add_argument("--factors", default="24,50")
+    parser.add_argument("--rotated", action="store_true", help="of SmolVLA and TurboVLA both also with rotated channels (tools/rotated.py)")
     parser.add_argument("--dtypes", nargs="+", default=["int8", "int4"])
     parser.add_argument("--vla", nargs="+", default=[os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla")], help="programs to compare")
     options = parser.parse_args()
@@ -270,9 +286,12 @@ def main():
             recording, planter = record(bundle, work / "recording", seen), Planter(bundle, options.every)
             places = planter.find(work / "planted.gguf", held[0])
             planter.write(work / "planted.gguf", places, factors)
-            for what, one in (("as it is", bundle), (f"{len(places)} of {len(planter.places)} planted", work / "planted.gguf")):
+            cases = {"as it is": bundle, f"{len(places)} of {len(planter.places)} planted": work / "planted.gguf"}
+            if options.rotated:
+                cases |= {f"{what}, rotated": rotate(one, work / f"rotated{i}.gguf", held[0]) for i, (what, one) in enumerate(cases.items())}
+            for what, one in cases.items():
                 for dtype, row in judge(one, work, recording, held, chunks(one, held, "float32"), options.vla, options.dtypes, is_trained):
-                    print(f"{name:<20} {what:<20} {dtype}  " + "  ".join(f"{error:6.2f} ({median:5.2f})" for error, median in row), flush=True)
+                    print(f"{name:<20} {what:<28} {dtype}  " + "  ".join(f"{error:6.2f} ({median:5.2f})" for error, median in row), flush=True)
 
 
 if __name__ == "__main__":
