@@ -170,6 +170,7 @@ test-cuda: build
 # The least memory of all published policies in all dtypes and kernels, of which `make test` tries some: half an hour, 8 GB of memory.
 test-budgets: build
 	VLA_ALL_BUDGETS=1 $(PYTHON) scripts/check.py cli/least
+	VLA_ALL_BUDGETS=1 $(PYTHON) scripts/check.py bench/budget
 
 # Downloads 90 MB of Debian's libraries for ARM into .cache.
 SYSROOT := .cache/sysroot-arm64

@@ -68,7 +68,8 @@ def programs():
     """{source file: the program that has its tests}, where several have: that of its folder."""
     out = {}
     for entry in json.loads((BUILD / "compile_commands.json").read_text()):
-        target = re.search(r"/CMakeFiles/(\w+)\.dir/", entry.get("output", entry["command"]))
+        # Before -o a command names the folder of its precompiled headers too; not every CMake has "output".
+        target = re.search(r"-o \S*CMakeFiles/(\w+)\.dir/", entry["command"])
         file = Path(entry["file"])
         if target and (file not in out or target[1] == f"test_{file.parent.name}"):
             out[file] = target[1]
