@@ -136,11 +136,9 @@ def check_python(found):
         text = "".join(module.read_text() for module in [*files, *modules(folder)])
         names = [name for file in files for name in found[file] or []]
         script = str(ROOT / "scripts/pytest.sh")
-        seen = []  # two suites of a folder may differ in what they leave out alone
-        for command, environment in suites():
-            if command[:2] != [script, str(folder)] or environment in seen:
-                continue
-            seen.append(environment)
+        # Two suites of a folder may differ only in what they leave out.
+        environments = {tuple(sorted(environment.items())) for command, environment in suites() if command[:2] == [script, str(folder)]}
+        for environment in map(dict, sorted(environments)):
             made = [value.removeprefix(f"{BUILD}/") for name, value in environment.items() if name in text]
             build([o for o in outputs() if any(o == m or o.startswith(f"{m}/") for m in made)])
             failed |= run([script, *map(str, files), *(["-k", " or ".join(names)] if names else [])], environment) != 0

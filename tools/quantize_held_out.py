@@ -27,6 +27,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from rotated import as_floats, rotated_tensors
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / folder) for folder in ("tools", "python", "tests/support", "tests/cli", "tests/client")]
@@ -186,7 +187,7 @@ class Planter:
                 by_columns[reader] = by_columns[reader] / by
         changed = {}
         for name in {*by_rows, *by_columns}:
-            floats = (values[name].astype(np.uint32) << 16).view(np.float32) if dtypes[name] == "bf16" else values[name]
+            floats = as_floats(values[name], dtypes[name])
             changed[name] = (floats * by_rows[name] * by_columns[name]).astype(np.float32)
         return write_like(self.bundle, self.content, path, changed)
 
@@ -209,8 +210,6 @@ class Planter:
 
 def rotate(bundle, path, observation):
     """The same policy in float32, its channels rotated."""
-    from rotated import rotated_tensors
-
     from vla_cpp.convert.bundle import read_bundle
 
     content = read_bundle(str(bundle))

@@ -133,10 +133,11 @@ FAMILIES = {"smolvla": rotate_smolvla, "turbovla": rotate_turbovla}
 
 def rotated_tensors(content):
     """{tensor: float32} of the rotated policy, for each of its floats."""
-    floats = {name: as_floats(values, content.dtypes[name]) for name, values in content.tensors.items() if content.dtypes[name] in ("bf16", "f32")}
+    dtypes = content.dtypes
+    floats = {name: as_floats(values, dtypes[name]).astype(np.float64) for name, values in content.tensors.items() if dtypes[name] in ("bf16", "f32")}
     FAMILIES[content.keys["vla.arch"]](Rotated(floats), content.keys)
     return {name: values.astype(np.float32) for name, values in floats.items()}
 
 
 def as_floats(values, dtype):
-    return ((values.astype(np.uint32) << 16).view(np.float32) if dtype == "bf16" else values).astype(np.float64)
+    return (values.astype(np.uint32) << 16).view(np.float32) if dtype == "bf16" else values

@@ -96,9 +96,8 @@ bool tries_all() { return std::getenv("VLA_ALL_BUDGETS") != nullptr; }
 
 /// What matrices are rounded to, and with VLA_ALL_BUDGETS all that multiplies them on this machine.
 std::vector<std::string> some_kernels() {
-  std::vector<std::string> names = {"", "portable", "int8", "int4"};
-  if (!tries_all()) return names;
-  names.insert(names.end(), {"float32", "bf16"});
+  if (!tries_all()) return {"", "portable", "int8", "int4"};
+  std::vector<std::string> names = {"", "float32", "bf16", "int8", "int4"};
   for (const KernelSet& set : usable_kernels())
     if (set != kernel_set::ggml) names.emplace_back(set.name);
   return names;
