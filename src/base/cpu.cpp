@@ -34,7 +34,7 @@ bool is_set(unsigned bits, int i) { return (bits >> i & 1U) != 0; }
 
 /// Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2, CPUID leaves 1 and 7.
 Features detect_features() {
-  __builtin_cpu_init();  // OSXSAVE: XGETBV tells which vector registers the operating system saves
+  __builtin_cpu_init();  // also checks by XGETBV which vector registers the operating system saves
   Features found = {Feature::baseline};
   const Registers leaf1(1, 0), leaf7(7, 0), more(7, 1);
   if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma") || !is_set(leaf1.c, 29))  // F16C

@@ -16,16 +16,16 @@ enum class Feature {
   avx512_bf16,
   avx512_vnni,
   avx_vnni,
-  amx_bf16,  // and the operating system permits tiles
+  amx_bf16,  // with the operating system's permission to use tiles
   amx_int8,
-  permutes_beside_vnni,  // as AMD's processors do in one cycle; Intel's do one or the other
+  permutes_beside_vnni,  // a permutation and a VNNI product in the same cycle: AMD, not Intel
   neon,
   dotprod,    // SDOT
   neon_bf16,  // BFMMLA
   i8mm,       // SMMLA
 };
 
-/// A set of features: those of a processor, or those that kernels may use.
+/// A set of features: those that a processor has, or those that kernels may use.
 class Features {
  public:
   constexpr Features() = default;
@@ -52,7 +52,7 @@ class Features {
 /// machine can link another definition.
 Features detect_features();
 
-/// The same, asked once.
+/// The features of this processor, detected at the first call.
 inline const Features& this_cpu() {
   static const Features features = detect_features();
   return features;

@@ -26,10 +26,10 @@ Error cannot_write(const std::string& path, int number) {
   return {Code::io, path, "a file that can be written", std::strerror(number)};
 }
 
-/// A file of this folder without a name, of which nothing is left where the program is killed; -1 where the system has
-/// none.
+/// Opens a file without a name in the folder; it vanishes if the program is killed. Returns -1 where the system has no
+/// such files.
 int open_unnamed(const std::string& folder, unsigned mode) {
-  if (::access("/proc/self/fd", X_OK) != 0) return -1;  // which names it in the end
+  if (::access("/proc/self/fd", X_OK) != 0) return -1;  // give_name needs it
   return ::open(folder.empty() ? "." : folder.c_str(), O_TMPFILE | O_RDWR | O_CLOEXEC, mode);
 }
 
@@ -38,7 +38,7 @@ bool give_name(int fd, const std::string& path) {
   return ::linkat(AT_FDCWD, unnamed.c_str(), AT_FDCWD, path.c_str(), AT_SYMLINK_FOLLOW) == 0;
 }
 
-/// A file that has its name from the start, locked for as long as it is written.
+/// Creates a file under its name and locks it until it is closed.
 int open_named(const std::string& path, unsigned mode) {
   const int fd = ::open(path.c_str(), O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, mode);
   if (fd >= 0) ::flock(fd, LOCK_EX | LOCK_NB);
@@ -57,7 +57,7 @@ Status write_new(const std::string& path, const WriteTo& write, unsigned mode) {
   return cannot_write(path, number);
 }
 
-/// Removes what programs that were killed have left of this file: parts that nobody writes any more.
+/// Removes parts of this file that killed programs have left: those that no program has locked.
 void remove_stale_parts(const fs::path& target) {
   std::error_code ignored;
   const fs::path folder = target.parent_path();
@@ -71,7 +71,7 @@ void remove_stale_parts(const fs::path& target) {
   }
 }
 
-/// A name beside `path` for what becomes it.
+/// The name of a part: `path` with a random suffix.
 std::string beside(const std::string& path) { return fmt::format("{}.{:08x}{}", path, std::random_device()(), kPart); }
 
 bool copy_all(int from, int to) {
@@ -85,7 +85,7 @@ bool copy_all(int from, int to) {
   }
 }
 
-/// What `write` writes, by way of a file without a name: a pipe cannot be written to out of order.
+/// Copies the output of `write` to `to` through a file without a name, because a pipe must be written in order.
 bool write_through(int to, const WriteTo& write) {
   const int fd = open_temporary();
   if (fd < 0) return false;
@@ -104,7 +104,7 @@ Status write_in_place(const std::string& path, int fd, const WriteTo& write) {
   return written ? Status() : cannot_write(path, number);
 }
 
-/// The open file that a path such as /dev/stdout or /dev/fd/3 stands for, whatever it leads to; -1 for other paths.
+/// The file descriptor that a path such as /dev/stdout or /dev/fd/3 names; -1 for other paths.
 int descriptor_of(const std::string& path) {
   if (path == "/dev/stdout") return STDOUT_FILENO;
   if (path == "/dev/stderr") return STDERR_FILENO;
@@ -116,7 +116,7 @@ int descriptor_of(const std::string& path) {
   return -1;
 }
 
-/// What links lead to, which need not be there. A link that leads to itself stays one.
+/// Follows symbolic links to their target, which need not exist. In a cycle of links, the result is a link.
 std::string behind_links(const std::string& path) {
   constexpr int kMaxLinks = 40;
   fs::path found = path;

@@ -17,8 +17,8 @@ namespace {
 
 constexpr std::string_view kMagic = "\x93NUMPY";
 
-/// The header is a Python dictionary literal that NumPy itself writes: {'descr': '<f4', 'fortran_order': False,
-/// 'shape': (2, 3), }
+/// Returns the header's text from the value of `key` on. The header is a Python dictionary literal that NumPy writes:
+/// {'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }
 std::string_view after(std::string_view header, std::string_view key) {
   const std::size_t at = header.find(key);
   if (at == std::string_view::npos) return {};

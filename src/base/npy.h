@@ -14,7 +14,7 @@ namespace vla {
 
 /// An array of a NumPy file: uint8 or float32, C order.
 struct NpyArray {
-  std::vector<std::size_t> shape;  // slowest dimension first, as NumPy has it
+  std::vector<std::size_t> shape;  // slowest dimension first, as in NumPy
   std::variant<std::vector<std::uint8_t>, std::vector<float>> values;
 };
 
@@ -23,8 +23,8 @@ struct NpyHeader {
   std::string descr;  // NumPy's type string, such as `<f4`
   bool is_fortran_order = false;
   std::vector<std::size_t> shape;
-  std::size_t count = 0;    // elements
-  std::size_t data_at = 0;  // where they begin in the file
+  std::size_t count = 0;    // number of elements
+  std::size_t data_at = 0;  // byte offset of the first element in the file
 };
 
 /// Whether bytes begin like a .npy file.

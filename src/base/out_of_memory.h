@@ -6,7 +6,7 @@
 
 namespace vla {
 
-/// Allocates nothing itself: its texts fit into the small-string buffers.
+/// Allocates nothing: the texts fit into the strings' own buffers.
 inline Error out_of_memory(const char* where) {
   return {Code::out_of_memory, where, "", "no memory left", "ask again later"};
 }

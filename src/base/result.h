@@ -9,8 +9,8 @@
 
 namespace vla {
 
-/// One class for each exit code and each code on the wire (src/wire/vla.proto); the numbers are the same. `code_name`
-/// gives the spelling that users see. The last seven are answers of a server.
+/// Error classes, one per exit code and per code on the wire (src/wire/vla.proto), with equal numbers. `code_name`
+/// gives the spelling that users see. The last seven are errors that a server returns.
 enum class Code {
   internal,
   usage,

@@ -16,7 +16,7 @@ Result<RandomBundle> make_random(const Request& request, const Watcher& watcher)
   return RandomBundle::make(request.arch, entry.published(), random_sizes(request));
 }
 
-/// Checks the bundle before measuring the machine, which takes seconds. Errors: those of Bundle::open.
+/// Checks the bundle first, since measuring the machine takes seconds. Errors: those of Bundle::open.
 Status check_bundle(const std::string& path) {
   const Result<Bundle> found = Bundle::open(path);
   return found ? Status() : Status(found.error());
@@ -25,7 +25,7 @@ Status check_bundle(const std::string& path) {
 Conditions conditions_of(const Engine& engine, const Workload& workload, int n_step) {
   const auto text = [&](const char* key) {
     return *engine.robot().bundle().keys().string(key);
-  };  // every bundle has them
+  };  // every bundle has these keys
   return {.policy = text("vla.arch"),
           .weights = text("vla.dtype"),
           .source = text("vla.source.name"),
@@ -39,7 +39,7 @@ Conditions conditions_of(const Engine& engine, const Workload& workload, int n_s
           .device = engine.device().name()};
 }
 
-/// Runs the rounds of every number of steps.
+/// Runs the rounds for every number of solver steps.
 Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const std::vector<int>& steps,
                                     const Request& request, const Watcher& watcher) {
   std::vector<Series> all;

@@ -13,9 +13,9 @@ struct Request {
   std::string arch;    // architecture of the random weights, at its published size
   DType dtype = DType::bf16;
   WorkloadSizes sizes;
-  std::vector<int> steps;  // the report is of the last one; with several it has a fit; empty: the bundle's own
+  std::vector<int> steps;  // solver steps; the report is on the last number; several add a fit; empty: the bundle's own
   int n_round = 7, n_warmup = 1;
-  int n_thread = 0;  // as in EngineOptions
+  int n_thread = 0;  // see EngineOptions
   std::string kernels, device, embodiment;
   std::size_t memory = 0;
 };

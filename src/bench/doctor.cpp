@@ -30,7 +30,7 @@ double median_cores(const Report& report) {
   return quantile(cores, 0.5);
 }
 
-/// Predicted milliseconds of a stage, or of all as `network`; 0 without a prediction.
+/// Predicted milliseconds of a stage, or of all stages as `network`; 0 without a prediction.
 double predicted_ms(const StagePredictions& stages, const std::string& name) {
   double seconds = 0;
   for (const auto& [stage, prediction] : stages)
@@ -47,7 +47,7 @@ void add_stages(Checkup& checkup, const StagePredictions& predicted) {
   checkup.host = checkup.total - report.find("network")->p50;
 }
 
-/// Predicted milliseconds of the network with large matrices as int8 codes; 0 where it has none of floats.
+/// Predicted milliseconds of the network with large matrices as int8 codes; 0 if that is not possible.
 double predict_int8(const Request& request) {
   const auto dry = Engine::load(
       request.bundle, {.n_thread = request.n_thread, .kernels = "int8", .dry = true, .embodiment = request.embodiment});
@@ -77,7 +77,7 @@ Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, 
   StagePredictions predicted;
   const bool on_cpu = request.device.empty() || request.device == "cpu";
   bool has_floats = false;
-  {  // sizes alone
+  {  // computes sizes and predictions without weights
     VLA_TRY(const std::unique_ptr<Engine> dry, Engine::load(request.bundle, {.n_thread = request.n_thread,
                                                                              .kernels = request.kernels,
                                                                              .device = request.device,

@@ -27,7 +27,7 @@ std::string proc_line(const char* file, const std::string& key) {
   return "";
 }
 
-/// Source: Linux, arch/arm64/include/asm/cputype.h.
+/// ARM's part numbers. Source: Linux, arch/arm64/include/asm/cputype.h.
 constexpr std::pair<unsigned, const char*> kArmParts[] = {
     {0xd03, "Cortex-A53"},   {0xd05, "Cortex-A55"},    {0xd07, "Cortex-A57"},  {0xd08, "Cortex-A72"},
     {0xd09, "Cortex-A73"},   {0xd0a, "Cortex-A75"},    {0xd0b, "Cortex-A76"},  {0xd0c, "Neoverse-N1"},

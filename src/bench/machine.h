@@ -34,7 +34,7 @@ std::string arm_cores(std::istream& cpuinfo);
 /// Processor time of all threads of this process, in seconds.
 double cpu_seconds();
 
-/// Resident memory of this process in bytes; 0 if the system does not tell.
+/// Resident memory of this process in bytes; 0 if the system does not report it.
 struct ProcessMemory {
   std::size_t peak = 0, now = 0;
 };

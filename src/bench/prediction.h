@@ -8,14 +8,14 @@
 
 namespace vla::bench {
 
-/// The time of an act as a model of a GPU predicts it, by stage, from counted work and published rates. Nothing runs.
+/// The predicted time of an act on a model of a GPU, by stage, from counted work and published rates. Nothing runs.
 struct GpuPrediction {
   std::string policy, device, linear_kernels;
   int n_view = 0, n_text = 0, n_step = 0;
   std::size_t memory = 0;  // bytes: weights, plan and working memory
   StagePredictions stages;
 
-  /// `total`, of all stages.
+  /// The sum of all stages.
   Program::Prediction total() const;
 };
 
@@ -23,7 +23,7 @@ struct GpuPrediction {
 /// usage, and those of Engine::load.
 Result<GpuPrediction> predict(const Request& request, const std::string& model);
 
-/// Text for display, and one JSON object on one line.
+/// to_text: for display. to_json: one JSON object on one line.
 std::string to_text(const GpuPrediction& prediction);
 std::string to_json(const GpuPrediction& prediction);
 

@@ -28,17 +28,17 @@ std::vector<std::string> numbered(const std::string& name, int count) {
   return names;
 }
 
-/// Where a prompt has the views' tokens, for networks that read them among text.
+/// The positions of the views' tokens in a prompt, for networks that read them among text.
 struct ViewPlaces {
-  int count = 0;   // none: the network takes images separately
-  int repeat = 0;  // tokens of a view
+  int count = 0;   // 0: the network takes images separately
+  int repeat = 0;  // tokens per view
   bool behind = false;
 
   static constexpr const char *kStarts = "policy.view_starts", *kStartsFromEnd = "policy.view_starts_from_end";
 
   static constexpr std::string_view kOpen = "View {i}: ", kToken = "<view>", kClose = "\n";
 
-  /// Every byte is a token and there are at most nine places, so `{i}` is one token.
+  /// Tokens of `kOpen`. Every byte is a token and there are at most nine places, so `{i}` is one token.
   int open_size() const { return static_cast<int>(kOpen.size()) - 2; }
   int size() const { return open_size() + repeat + static_cast<int>(kClose.size()); }
   std::vector<std::int64_t> starts() const {
@@ -129,7 +129,7 @@ std::string added_token(std::string_view content, std::size_t id) {
   return nlohmann::ordered_json::array({token}).dump();
 }
 
-/// Of a policy that decodes: every sequence of tokens stands for a chunk.
+/// Adds action tokens for a policy that decodes tokens: every sequence of tokens stands for a chunk.
 void add_action_tokens(Keys& keys) {
   const Keys added({{"action_tokens.kind", "fast"},
                     {"action_tokens.vocab", std::vector<std::string>{"a"}},
@@ -147,10 +147,10 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
   VLA_TRY(const int d_action, keys.integer("policy.d_action", kAnySize));
   VLA_TRY(const ViewPlaces places, view_places(keys, image));
   const int d_robot = std::min({kRobot, d_state > 0 ? d_state : kRobot, d_action});
-  int n_row = sizes.max_tokens;  // of a text
+  int n_row = sizes.max_tokens;  // most tokens of a text
   if (keys.has("policy.n_row")) {
     VLA_TRY(n_row, keys.integer("policy.n_row", kAnySize));
-    if (n_row == 0) n_row = sizes.max_tokens;  // without a limit
+    if (n_row == 0) n_row = sizes.max_tokens;  // 0: no limit
   }
   // A policy without a vocabulary reads no instruction.
   const int max_tokens = keys.has("lm.n_vocab") ? places.count * places.size() + std::min(sizes.max_tokens, n_row) : 0;
@@ -207,7 +207,7 @@ std::uint64_t next_random(std::uint64_t& state) {
   return z ^ (z >> 31);
 }
 
-/// Truncates the value to 16 bits. This is exact enough for random values of ordinary size; values below f16's normal
+/// Truncates a value to 16 bits. This is exact enough for random values of ordinary size; values below f16's normal
 /// range become zero.
 std::uint16_t to_16_bits(float value, DType type) {
   std::uint32_t bits;
@@ -230,7 +230,7 @@ std::string random_bytes(std::size_t count, DType type, std::uint64_t seed) {
   return bytes;
 }
 
-/// Bytes of four random ternary elements.
+/// Bytes of four random ternary elements each.
 std::string random_codes(std::size_t count, std::uint64_t seed) {
   std::string bytes(count, '\0');
   for (char& four : bytes)
@@ -266,7 +266,7 @@ class Values {
  private:
   static constexpr std::size_t kPool = std::size_t{1} << 22;  // random elements before they repeat
 
-  /// A vector named `kernel` is that of a depthwise convolution, whose result is added to its input.
+  /// Whether a vector is a bias, or the kernel of a depthwise convolution whose result is added to its input.
   static bool is_added(const Param& param) { return param.name.ends_with("bias") || param.name.ends_with("kernel"); }
   static std::size_t longest_vector(const ParamList& list) {
     std::int64_t longest = 1;
@@ -290,7 +290,8 @@ std::vector<TensorInfo> tensors_of(const ParamList& list, const RandomSizes& siz
   return tensors;
 }
 
-/// Memory, or a file on the disk where memory has no room for the weights and their copy in an engine; -1 on failure.
+/// Opens a file in memory, or on the disk if memory cannot hold the weights and an engine's copy of them; -1 on
+/// failure.
 int open_bundle(const std::vector<TensorInfo>& tensors, const RandomSizes& sizes) {
   std::size_t size = 0;
   for (const TensorInfo& tensor : tensors) size += tensor.data.size();

@@ -13,12 +13,12 @@ struct RandomSizes {
   int n_view = 2, max_tokens = 48, n_step = 10;
   DType dtype = DType::bf16;  // dtype of matrices and tables
   std::uint64_t seed = 0;
-  bool is_filled = true;  // else weights read as zeros and take no memory
+  bool is_filled = true;  // false: weights read as zeros and take no memory
 };
 
-/// A valid bundle of random weights, to measure a network of that size without a checkpoint. It is kept in memory, or,
-/// where that has no room for the bundle and an engine's copy of it, in a temporary file without a name, and is gone
-/// with the object. Values repeat after some millions, which does not change a product's time.
+/// A valid bundle of random weights, to measure a network of that size without a checkpoint. It is kept in memory, or
+/// in an unnamed temporary file if memory cannot hold the bundle and an engine's copy of it, and is deleted with the
+/// object. Values repeat after some millions, which does not change a product's time.
 class RandomBundle {
  public:
   /// `network` has the keys that the architecture declares, such as PolicyEntry::published. Features, recipe, solver
@@ -29,7 +29,7 @@ class RandomBundle {
   RandomBundle& operator=(RandomBundle&&) = delete;
   ~RandomBundle();
 
-  /// A path by which this process can open it.
+  /// A path by which this process can open the bundle.
   std::string path() const { return "/proc/self/fd/" + std::to_string(file_); }
 
  private:

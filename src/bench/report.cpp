@@ -30,7 +30,7 @@ StageRow make_row(const std::string& name, const std::vector<double>& times, con
   row.flop_rate = work.flop / (1e-3 * row.p50);
   row.byte_rate = work.bytes / (1e-3 * row.p50);
   if (!report.conditions.on_cpu()) return row;  // the probes measure the CPU only
-  // A disturbed probe would flatter its round, so no round's peak counts less than the median.
+  // A disturbed probe would overstate its round's share, so every peak counts at least as the median.
   const double min_peak = median_of(report.rounds, &Round::peak),
                min_int8_peak = median_of(report.rounds, &Round::int8_peak);
   std::vector<double> shares;

@@ -118,7 +118,7 @@ class Drawing {
     text(24, middle, "GFLOP per second", fmt::format("text-anchor=\"middle\" transform=\"rotate(-90 24 {})\"", middle));
   }
 
-  /// A horizontal roof over all intensities at which memory is fast enough, with its name above or below.
+  /// Draws a horizontal roof over all intensities at which memory is fast enough, with its name above or below.
   void flat_roof(double rate, const std::string& label, const std::string& style) {
     const double left = std::max(x_.at(std::max(rate / report_.bandwidth(), x_.low)), kLeft), y = y_.at(rate);
     line(left, y, kRight, y, style);

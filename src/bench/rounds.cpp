@@ -48,11 +48,11 @@ double Round::total() const {
 Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher) {
   const Features use = engine.device().features();
   const kernels::PeakProbe& probe = kernels::peak_probe_of(use);
-  // A GPU would lower its clock while the CPU is probed, and its times stand beside no peak of the CPU.
+  // No probes with a GPU: it would lower its clock meanwhile, and its times are not compared with the CPU's peak.
   const bool has_peaks = engine.device().is_host();
   const kernels::PeakProbe* int8 =
       has_peaks && engine.has_int8_products() ? kernels::int8_probe_of(use, engine.has_ternary()) : nullptr;
-  const auto measure_peaks = [&](Round& round) {  // half of what is before and after
+  const auto measure_peaks = [&](Round& round) {  // called before and after a round
     if (!has_peaks) return;
     const int n_thread = engine.device().n_thread();
     round.peak += kernels::measure_peak(probe, n_thread, kProbeSeconds) / 2;

@@ -14,9 +14,9 @@ namespace vla::bench {
 /// One observation, timed; on the CPU between two short probes of the machine's peak.
 struct Round {
   Timing stages;         // ms; "decode" first
-  double peak = 0;       // operations per second of all threads, the mean of before and after; 0 beside a GPU
-  double cores = 0;      // CPU time over wall time: how many cores the run really had
-  double int8_peak = 0;  // the same of int8 products, where the network has any
+  double peak = 0;       // operations per second of all threads, the mean of before and after; 0 on a GPU
+  double cores = 0;      // CPU time over wall time: how many cores the round really used
+  double int8_peak = 0;  // the same for int8 products; 0 if the network has none
 
   double total() const;  // ms
 };
@@ -24,10 +24,10 @@ struct Round {
 /// Rounds with one number of solver steps.
 struct Series {
   int n_step = 0;
-  std::string peak_name, int8_peak_name;  // highest probe between the rounds
+  std::string peak_name, int8_peak_name;  // names of the probes between the rounds
   std::vector<Round> rounds;
   StageWork work;                                     // work of the network's stages
-  std::vector<std::pair<std::string, double>> times;  // Device::times of the last round before the measured ones
+  std::vector<std::pair<std::string, double>> times;  // Device::times of the last warm-up round
 };
 
 /// Observes a run: receives its messages, and is called before each round, which it may delay or refuse.
@@ -36,8 +36,8 @@ struct Watcher {
   std::function<Status()> before_round;
 };
 
-/// Runs the loop: probe, observation, probe, ..., or without probes on another device, after rounds that are not
-/// counted. Errors: those of Engine::act.
+/// Runs warm-up rounds, then measured rounds: probe, observation, probe, ...; without probes on devices other than the
+/// CPU. Errors: those of Engine::act.
 Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher);
 
 /// total(T) = prefix + T * step, in ms, fitted by least squares to the network's median times.

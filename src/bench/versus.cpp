@@ -15,7 +15,7 @@ namespace {
 constexpr std::size_t kMaxFile = std::size_t{64} << 20;
 constexpr double kSamePeak = 0.05;
 
-/// The report is the last line of the program's output.
+/// Returns the last line of a program's output, which is the report.
 std::string last_line(std::span<const std::byte> bytes) {
   std::string text(reinterpret_cast<const char*>(bytes.data()), bytes.size());
   while (!text.empty() && (text.back() == '\n' || text.back() == '\r')) text.pop_back();

@@ -47,7 +47,7 @@ Result<int> count_tokens(const Processor& processor, const Observation& observat
   return static_cast<int>(inputs.tokens.size()) - processor.n_view_tokens();
 }
 
-/// Tokens left for the instruction beside the views.
+/// Tokens left for the instruction after those of the views.
 int most_text(const Processor& processor) { return processor.recipe().max_tokens - processor.n_view_tokens(); }
 
 /// A text of exactly `n_token` tokens: one word repeated. Several words are tried, since tokenizers split them

@@ -24,7 +24,7 @@ class Workload {
   /// Errors: usage, if the bundle cannot take such an observation.
   static Result<Workload> make(const Processor& processor, const WorkloadSizes& sizes);
 
-  /// Decodes the frames again, as a program would that receives files.
+  /// Decodes the frames again, like a program that receives image files.
   Status decode();
   const Observation& observation() const { return observation_; }
 

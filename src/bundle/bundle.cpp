@@ -40,7 +40,7 @@ class Checksum {
   std::string text() const { return fmt::format("{:016x}", XXH3_64bits_digest(state_.get())); }
 
  private:
-  /// Hashes the bytes of `part` up to the file's byte `end`, or as many zeros, and removes them from `part`.
+  /// Hashes the bytes of `part` up to the file's byte `end`, or as many characters '0', and removes them from `part`.
   void take(std::span<const std::byte>& part, std::size_t end, bool as_zeros) {
     constexpr char kZeros[kDigits + 1] = "0000000000000000";
     const std::size_t size = done_ < end ? std::min(part.size(), end - done_) : 0;
@@ -56,8 +56,8 @@ Status check_sum(Content& content, const Keys& keys, const std::string& name) {
   VLA_TRY(const std::string stated, keys.string(kChecksumKey));
   if (stated.size() != kChecksumPrefix.size() + kDigits || !stated.starts_with(kChecksumPrefix))
     return Error{Code::bad_bundle, name + ": " + std::string(kChecksumKey), "xxh3: and 16 hex digits", stated};
-  // Finds the digits by their key. The key's text occurs once before them: digits at any other place would give another
-  // hash.
+  // Finds the digits by their key. If a copy of them stands earlier in the file, the hash differs and the bundle is
+  // refused.
   const std::string_view text(reinterpret_cast<const char*>(content.shown().data()), content.shown().size());
   const std::size_t key = text.find(kChecksumKey);
   Checksum checksum(text.find(stated, key) + kChecksumPrefix.size());
@@ -75,7 +75,7 @@ Status check_version(const Keys& keys, const std::string& name) {
                version < kBundleVersion ? "run vla-convert again" : "this bundle needs a newer vla"};
 }
 
-/// The source of the weights, which every answer and report names.
+/// Checks the keys that identify the weights; every answer and report contains them.
 Status check_identity(const Keys& keys) {
   for (const char* key : {"vla.arch", "vla.source.name", "vla.source.revision", "vla.source.converter"})
     if (const auto text = keys.string(key); !text) return text.error();
@@ -103,7 +103,7 @@ std::pair<std::string, std::string> split_name(const std::string& name) {
   return {name.substr(first, dot - first), name.substr(std::min(dot + 1, name.size()))};
 }
 
-/// Checks a name of one robot: its tag is listed, and the robots share no key or tensor of that name.
+/// Checks a key or tensor of one robot: its tag is listed, and no shared key or tensor has the same name.
 Status check_own_name(const std::string& full, const std::vector<std::string>& tags,
                       const std::function<bool(const std::string&)>& is_shared, const std::string& where) {
   if (!full.starts_with(kEmbodimentPrefix)) return {};
@@ -117,7 +117,7 @@ Status check_own_name(const std::string& full, const std::vector<std::string>& t
   return Error{Code::bad_bundle, where + full, "a name that is not shared by all robots", "both", "convert it again"};
 }
 
-/// Checks the list of robots, and that the keys and tensors of each are separate from those that all share.
+/// Checks the list of robots, and that no robot's own key or tensor has the name of a shared one.
 Result<std::vector<std::string>> read_embodiments(const GgufContent& content, const std::string& name) {
   std::vector<std::string> tags;
   if (content.keys.has(kEmbodimentsKey)) {

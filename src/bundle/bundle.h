@@ -17,7 +17,7 @@
 
 namespace vla {
 
-/// A tensor as stored in the file. `shape` follows ggml: fastest dimension first. `data` of an opened bundle is read by
+/// A tensor as stored in the file. `shape` follows ggml: fastest dimension first. Read `data` of an opened bundle with
 /// Bundle::read.
 struct TensorInfo {
   std::string name;
@@ -58,8 +58,8 @@ class Bundle {
   std::size_t file_size() const { return content_->bytes().size(); }
   /// The byte range of a tensor in the file.
   std::ptrdiff_t offset(const std::byte* data) const { return data - content_->bytes().data(); }
-  /// The bytes of a tensor or of a part of it, in `buffer` where they come from a file. Errors: bad_bundle, where the
-  /// file has been changed since it was opened.
+  /// Returns the bytes of a tensor or of a part of it. Bytes of a file are read into `buffer`. Errors: bad_bundle if
+  /// the file has changed since it was opened.
   Result<std::span<const std::byte>> read(std::span<const std::byte> part, ReadBuffer& buffer) const;
   /// The file or memory that tensors are read from; it may outlive the bundle.
   const std::shared_ptr<const Content>& content() const { return content_; }
@@ -74,7 +74,7 @@ class Bundle {
   std::shared_ptr<const Content> content_;
   Keys keys_;
   std::vector<TensorInfo> tensors_;
-  std::unordered_map<std::string, std::size_t> index_;  // of tensors_, by name
+  std::unordered_map<std::string, std::size_t> index_;  // from a name to an index into tensors_
 };
 
 }  // namespace vla

@@ -23,7 +23,7 @@ constexpr const char* kReplace = "replace a bundle by renaming a new file over i
 
 Error io_error(const std::string& path, const char* what) { return {Code::io, path, what, std::strerror(errno)}; }
 
-/// How many bytes were read: fewer than asked for at the end of the file, -1 with errno on failure.
+/// Returns the number of bytes read: fewer than requested at the end of the file, -1 with errno set on failure.
 ssize_t read_at(int file, std::size_t offset, std::span<std::byte> to) {
   std::size_t done = 0;
   while (done < to.size()) {
@@ -63,7 +63,7 @@ Content::~Content() {
   if (!bytes_.empty()) ::munmap(const_cast<std::byte*>(bytes_.data()), bytes_.size());
 }
 
-/// Reads bytes that the file must have.
+/// Fills `to` from the file. A file that ends earlier is an error.
 Status Content::fill(std::size_t offset, std::span<std::byte> to) const {
   const ssize_t got = read_at(file_, offset, to);
   if (got < 0) return io_error(path_, "a readable bundle");
@@ -93,7 +93,7 @@ Status Content::seal(const std::function<void(std::span<const std::byte>)>& see)
   sums_.reserve(bytes_.size() / kBlock + 1);
   for (std::size_t offset = 0; offset < bytes_.size(); offset += kPiece) {
     std::span<const std::byte> piece = bytes_.subspan(offset, std::min(kPiece, bytes_.size() - offset));
-    if (offset >= shown_) {  // what was shown has been parsed as it is
+    if (offset >= shown_) {  // bytes before shown_ are in memory and are hashed as they were parsed
       const std::span<std::byte> to(buffer.take(kPiece), piece.size());
       VLA_CHECK(fill(offset, to));
       piece = to;

@@ -14,7 +14,7 @@
 
 namespace vla {
 
-/// Memory that parts of a file are read into, again and again.
+/// A reusable buffer for parts of a file.
 class ReadBuffer {
  public:
   /// At least `size` bytes, at a multiple of 64. Throws std::bad_alloc.
@@ -46,19 +46,21 @@ class Content {
   Content& operator=(const Content&) = delete;
   ~Content();
 
-  /// All bytes. Of a file only the part that `show` read may be accessed; the rest are reserved addresses.
+  /// All bytes. If they come from a file, only the part that `show` has read may be accessed; the rest is reserved
+  /// address space.
   std::span<const std::byte> bytes() const { return bytes_; }
-  /// Reads the first `n` bytes of a file or more. Errors: io, bad_bundle.
+  /// Reads at least the first `n` bytes of a file. Errors: io, bad_bundle, out_of_memory.
   Status show(std::size_t n);
   std::span<const std::byte> shown() const { return bytes_.first(shown_); }
 
   /// Calls `see` with each part of the file in order, then releases what `show` read. Errors: io, bad_bundle.
   Status seal(const std::function<void(std::span<const std::byte>)>& see);
 
-  /// Bytes per second that `seal` read and compared; 0 for memory.
+  /// Bytes per second that `seal` read and hashed; 0 for memory.
   double read_rate() const { return read_rate_; }
-  /// A part of `bytes()`, in `buffer` where there is a file; null where the file has not these bytes any more. Takes no
-  /// memory once `buffer` has `buffer_size` of the part. Threads may read at a time.
+  /// Returns a part of `bytes()`. Bytes of a file are read into `buffer`; null if the file has changed. Allocates
+  /// nothing once `buffer` holds buffer_size(part.size()) bytes. Several threads may call it at once, each with its own
+  /// buffer.
   const std::byte* read(std::span<const std::byte> part, ReadBuffer& buffer) const;
   static constexpr std::size_t buffer_size(std::size_t size) { return (size / kBlock + 2) * kBlock; }
   /// Has the system read a part of the file ahead, without waiting for it.

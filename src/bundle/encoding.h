@@ -46,7 +46,7 @@ inline std::size_t dtype_size(DType type, std::int64_t n) {
 constexpr bool is_float(DType type) { return type == DType::f32 || type == DType::f16 || type == DType::bf16; }
 
 /// How a parameter is stored in a file or in memory: the dtype of its elements, and one float32 scale for every `group`
-/// of them in row order, by which codes become values. 0: no scales.
+/// of them in row order; an element is its code times the scale. `group` is 0 if there are no scales.
 struct Encoding {
   DType type = DType::f32;
   std::int64_t group = 0;
@@ -61,7 +61,7 @@ struct Encoding {
   bool operator==(const Encoding&) const = default;
 };
 
-/// Decodes n int8 or int4 codes, whole groups of them: code * scale.
+/// Decodes n int8 or int4 codes, a multiple of the group: code * scale.
 void widen_codes(const Encoding& encoding, const std::byte* codes, const float* scales, std::int64_t n, float* to);
 
 }  // namespace vla

@@ -25,7 +25,7 @@ constexpr std::size_t kMaxShown = 4096;  // longest text that is displayed, in b
 
 using Show = std::function<Status(std::size_t n)>;
 
-/// A cursor over the bytes. Every read checks how many are left; after a failure all later reads fail.
+/// A cursor over the bytes. Every read checks how many are left.
 class Cursor {
  public:
   Cursor(std::span<const std::byte> bytes, const std::string& name, const Show& show)
@@ -162,7 +162,8 @@ Result<Value> read_value(Cursor& cursor, const std::string& what) {
   return cursor.bad(what, "a GGUF value type from 0 to 12", std::to_string(type));
 }
 
-/// Refuses names that could control a terminal, start a new line or fill a log: they are displayed and sent to clients.
+/// Refuses text that could control a terminal, start a new line or fill a log, because it is displayed and sent to
+/// clients.
 Status check_shown(const Cursor& cursor, const std::string& what, const std::string& text) {
   if (text.size() > kMaxShown)
     return cursor.bad(printable(what.substr(0, kMaxShown)), fmt::format("text of at most {} bytes", kMaxShown),
@@ -177,7 +178,7 @@ bool is_for_machine(std::string_view key) {
   return key.starts_with("tokenizer.") || key.starts_with("processor.");
 }
 
-/// Checks all other texts, which may be displayed: the source, tags, and names of features, columns and units.
+/// Checks the texts that may be displayed: the source, tags, and names of features, columns and units.
 Status check_shown(const Cursor& cursor, const std::string& key, const Value& value) {
   if (is_for_machine(key)) return {};
   if (const auto* text = std::get_if<std::string>(&value)) return check_shown(cursor, key, *text);

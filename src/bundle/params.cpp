@@ -14,7 +14,7 @@ constexpr std::size_t kMaxLines = 50;  // problems in a report; more mean the wr
 
 std::string shape_text(const std::vector<std::int64_t>& shape) { return fmt::format("[{}]", fmt::join(shape, ", ")); }
 
-/// The dtypes that the bundle's tensor may have, for people.
+/// The dtypes that the bundle's tensor may have, as text for an error.
 const char* dtypes_of(const Param& param) {
   if (!is_float(param.encoding.type)) return dtype_name(param.stored_type());
   return param.storage == Storage::vector  ? "f32"
@@ -22,7 +22,7 @@ const char* dtypes_of(const Param& param) {
                                            : "f32, bf16, f16 or i8";
 }
 
-/// Whether it may be so where the policy declares floats.
+/// Whether the bundle's tensor may have this dtype for a parameter that the policy declares as floats.
 bool allows(const Param& param, DType type) {
   if (param.storage == Storage::vector) return type == DType::f32;
   return is_float(type) || (param.storage == Storage::matrix && type == DType::i8);
@@ -45,7 +45,7 @@ bool has_wrong_code(DType type, std::span<const std::byte> codes) {
   return wrong != std::byte{};
 }
 
-/// The same check for a tensor, which is read part by part.
+/// The same check for a tensor of a bundle, which is read in parts.
 Result<bool> has_wrong_code(const Bundle& bundle, DType type, std::span<const std::byte> codes) {
   constexpr std::size_t kPart = sizeof(Int4Block) << 15;
   ReadBuffer buffer;
@@ -62,8 +62,8 @@ const char* codes_text(DType type) {
                                 : "-127 to 127, file has -128";
 }
 
-/// The encoding of the bundle's tensor for a matrix that may be quantized; codes have one scale per row. A row of as
-/// many bytes as elements is int8, even if it has 33 or 66 bytes, which int4 blocks could have too.
+/// The encoding of the bundle's tensor for a matrix that may be quantized; codes have one scale per row. A row with as
+/// many bytes as elements is int8, even if it has 33 or 66 bytes, which is also a size of int4 rows.
 Encoding encoding_of(const TensorInfo& tensor, const std::vector<std::int64_t>& shape) {
   if (tensor.type != DType::i8) return {tensor.type};
   const bool is_int4 = !tensor.shape.empty() && tensor.shape[0] != shape[0] &&
@@ -79,7 +79,7 @@ const char* Param::storage_text() const {
 }
 
 /// The name of a parameter's scales. A module has one ternary matrix, whose scale BitLinear calls `scale`. Other
-/// matrices may share a module, so theirs is `<matrix>_scale`.
+/// matrices may share a module, so their scales are named `<matrix>_scale`.
 std::string scales_name(const std::string& param, const Encoding& encoding) {
   if (encoding.type != DType::ternary) return param + "_scale";
   return param.substr(0, param.rfind('.') + 1) + "scale";

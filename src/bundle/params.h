@@ -15,7 +15,7 @@
 
 namespace vla {
 
-/// What a parameter is used for. A matrix or a table may have any float dtype of the bundle, a vector f32 only. A
+/// How a parameter is used. A matrix or a table may have any float dtype of the bundle, a vector f32 only. A
 /// matrix of floats may also be quantized: int8 codes from -127 to 127 or int4 blocks, with one scale per row.
 enum class Storage { matrix, table, vector };
 
@@ -46,8 +46,8 @@ std::string scales_name(const std::string& param, const Encoding& encoding);
 /// bundle.
 class ParamList {
  public:
-  /// `bundle` may be null: then the list is a manifest of what the keys ask for, without tensors. Both arguments must
-  /// outlive the list.
+  /// `bundle` may be null: then the list is a manifest of the parameters that the keys require, without tensors. Both
+  /// arguments must outlive the list.
   ParamList(const Keys& keys, const Bundle* bundle)
       : keys_(&keys), bundle_(bundle), declared_(std::make_shared<Declared>()) {}
   /// The list of another robot of the same file. Robots share parameters: one that was declared for another robot is
@@ -60,13 +60,13 @@ class ParamList {
   const std::deque<Param>& params() const { return declared_->params; }
   const Bundle* bundle() const { return bundle_; }
 
-  /// Declares a parameter and, if `encoding` has scales, the vector `scale` beside it.
+  /// Declares a parameter and, if it is encoded with scales, the vector of its scales.
   const Param& declare(std::string name, Storage storage, std::vector<std::int64_t> shape, Encoding encoding = {});
   void problem(std::string line) { problems_.push_back(std::move(line)); }
   void problem(const Error& error);
 
-  /// Returns all problems, including every tensor of the bundle that is neither declared nor accepted by `is_used`: the
-  /// first 50, and how many more. Errors: bad_bundle.
+  /// Returns all problems, including every tensor of the bundle that is neither declared nor accepted by `is_used`. The
+  /// error lists the first 50 and the number of the rest. Errors: bad_bundle.
   Status report(const std::string& policy, const std::function<bool(const std::string&)>& is_used) const;
 
  private:
@@ -80,7 +80,7 @@ class ParamList {
   const Keys* keys_;
   const Bundle* bundle_;
   std::shared_ptr<Declared> declared_;
-  std::set<std::string> names_;  // of this robot
+  std::set<std::string> names_;  // tensors that this robot declares
   std::vector<std::string> problems_;
 };
 

@@ -4,7 +4,7 @@
 
 #include "bundle/keys.h"
 
-/// Optional keys: what a checkpoint says of how it is run, which changes no number of a chunk.
+/// Optional keys that say how to run a checkpoint. They change no number of an action chunk.
 namespace vla {
 
 inline constexpr const char* kActionSteps = "action.n_action_steps";

@@ -14,7 +14,7 @@ namespace vla::capi {
 /// The result of `vla_describe` and the memory that its pointers refer to. It must not be moved.
 class Description {
  public:
-  /// One robot, or several.
+  /// Describes one robot or several.
   explicit Description(const std::vector<vla::Description>& robots);
   Description(const Description&) = delete;
   Description& operator=(const Description&) = delete;

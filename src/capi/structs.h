@@ -42,7 +42,7 @@ Result<T> read_struct(const void* given, const std::string& where) {
   return known;
 }
 
-/// An array of such structs. The first one's size is the stride.
+/// Reads an array of such structs. The first one's size is the stride.
 template <class T>
 Result<std::vector<T>> read_structs(const T* given, std::size_t count, const std::string& where) {
   if (count > kMaxEntry) return usage(where, fmt::format("at most {} entries", kMaxEntry), std::to_string(count));
@@ -60,7 +60,7 @@ Result<std::vector<T>> read_structs(const T* given, std::size_t count, const std
   return known;
 }
 
-/// A name that ends with NUL.
+/// Reads a name that ends with NUL.
 inline Result<std::string> read_name(const char* given, const std::string& where) {
   if (given == nullptr) return usage(where, "a name", "NULL");
   const std::size_t size = ::strnlen(given, kMaxName + 1);

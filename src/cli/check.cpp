@@ -23,9 +23,9 @@ struct CheckOptions {
   std::string bundle, door, embodiment, save, robot;
   std::optional<std::string> text;
   std::vector<std::string> images;   // KEY=FILE
-  std::vector<std::string> cameras;  // of the robot
-  std::vector<float> state;          // of its motors
-  serve::ServerOptions server;       // what vla serve would be told
+  std::vector<std::string> cameras;  // cameras of the robot
+  std::vector<float> state;          // readings of the robot's motors
+  serve::ServerOptions server;       // the options that vla serve would get
 };
 
 std::string numbers_told(const google::protobuf::RepeatedPtrField<v1::Dimension>& numbers) {
@@ -88,7 +88,7 @@ void print_rest(const serve::Names& names, const v1::Description& description) {
         columns.convention.is_degrees ? " in degrees" : "", columns.convention.is_flipped ? " as 1 - x" : "");
 }
 
-/// A client's frames from files, as the policy would see them, which are written into the folder.
+/// Reads a client's frames from files, and writes them to the folder as the policy would see them.
 Status save_frames(const CheckOptions& options, const serve::Names& names, const Engine& engine,
                    Observation& observation) {
   for (const std::string& image : options.images) {
@@ -107,8 +107,8 @@ Status save_frames(const CheckOptions& options, const serve::Names& names, const
   return {};
 }
 
-/// What the policy answers to the observation, as the robot would get it: a plot, and the largest step that its motors
-/// would make first.
+/// Computes the policy's chunk for the observation, as the robot would get it. Writes a plot, and prints the largest
+/// first step of a motor.
 Status save_chunk(const CheckOptions& options, const RobotModel& robot, const serve::Names& names, Engine& engine,
                   Observation observation) {
   const std::size_t n = robot.motors.size();

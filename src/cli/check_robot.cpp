@@ -26,7 +26,7 @@ std::vector<Motor> aloha_motors() {
           {"right_wrist_rotate", "radians"}, {"right_gripper", "0 to 1"}};
 }
 
-/// A motor's name without what LeRobot adds to it in features.
+/// A motor's name without the `.pos` that LeRobot's features append.
 std::string bare(std::string name) {
   if (name.ends_with(".pos")) name.resize(name.size() - 4);
   return name;
@@ -44,14 +44,14 @@ std::string column_told(int i, const v1::Dimension& column) {
   return fmt::format("{} {}{}", i, name, column.unit().empty() ? "" : fmt::format(" [{}]", printable(column.unit())));
 }
 
-/// Compares the robot's motors with columns of the policy, and collects what does not fit.
+/// Compares the robot's motors with columns of the policy, and collects the differences.
 class Columns {
  public:
   Columns(const char* what, const google::protobuf::RepeatedPtrField<v1::Dimension>& columns, bool is_in_order,
           std::function<bool(int)> is_degrees)
       : what_(what), columns_(columns), is_in_order_(is_in_order), is_degrees_(std::move(is_degrees)) {}
 
-  /// The column of motor i, for a table.
+  /// Returns the column of motor i for the table; adds its differences to `problems`.
   std::string of(int i, const Motor& motor, std::vector<std::string>& problems) const {
     if (i >= columns_.size()) {
       problems.push_back(fmt::format("{}: no column for {}, the policy has {}", what_, motor.name, columns_.size()));

@@ -11,34 +11,35 @@
 
 namespace vla::cli {
 
-/// A number that a robot's motors give and take.
+/// A motor: the name and the unit of its reading and command.
 struct Motor {
   const char *name, *unit;
 };
 
-/// A robot as LeRobot has it: motors in its order, and cameras where they have usual names.
+/// A robot of LeRobot: its motors in LeRobot's order, and its cameras if they have usual names.
 struct RobotModel {
   const char* name;
   std::vector<Motor> motors;
   std::vector<std::string> cameras;
 };
 
-/// The models, and the names of all for a message.
+/// The known robot models.
 const std::vector<RobotModel>& robot_models();
 
-/// What the robot would send where, as LeRobot's door passes it on.
+/// Compares a robot with a policy that `vla serve --lerobot` would serve to it.
 struct RobotCheck {
   const RobotModel& robot;
-  std::vector<std::string> cameras;  // of its configuration
+  std::vector<std::string> cameras;  // from the robot's configuration
   const serve::Names& names;
   const v1::Description& description;
   const Robot& policy;
 
-  /// Prints which motor and camera goes where, and what is missing. The number of problems.
+  /// Prints the column of each motor, the view of each camera, and what is missing. Returns the number of problems.
   int print() const;
 };
 
-/// A chunk's columns over its rows as SVG, with where the robot is before them, for the columns that have such a value.
+/// Draws each column of a chunk over its rows as SVG, with the robot's state before the chunk for the columns that have
+/// one.
 std::string plot_chunk(const std::vector<float>& rows, const std::vector<std::string>& names,
                        const std::vector<std::optional<float>>& state);
 

@@ -30,12 +30,12 @@ constexpr const char* kDeviceHelp =
 constexpr const char* kEmbodimentHelp =
     "The robot, by its tag, where the bundle is for several; an error lists the valid ones";
 
-/// Help of --strict-state, wherever observations come in.
+/// Help of --strict-state, for each command that takes observations.
 constexpr const char* kStrictStateHelp =
     "Refuse a state that is far beyond what the policy has seen, instead of answering with a note";
 
-/// An option with a value that is not empty, which CLI11 would read as not given. `type`: what the help calls the
-/// value.
+/// Adds an option whose value must not be empty: CLI11 would read an empty value as not given. `type`: what the help
+/// calls the value.
 inline CLI::Option* add_text(CLI::App& command, const char* name, std::string& value, const char* type,
                              const std::string& help) {
   const auto given = [](const std::string& text) {
@@ -44,19 +44,19 @@ inline CLI::Option* add_text(CLI::App& command, const char* name, std::string& v
   return command.add_option(name, value, help)->type_name(type)->check(CLI::Validator(given, ""));
 }
 
-/// Digits for what 1.5GB, 800M and 2GiB stand for. What comes back is the problem, or empty.
+/// Replaces a size such as 1.5GB, 800M or 2GiB by its bytes in digits. Returns the problem, or empty.
 std::string read_bytes(std::string& text);
 
-/// An option that takes bytes.
+/// Adds an option that takes a size in bytes.
 template <class Bytes>
 CLI::Option* add_bytes(CLI::App& command, const char* name, Bytes& bytes, const std::string& help) {
   return command.add_option(name, bytes, help)->type_name("BYTES")->transform(CLI::Validator(read_bytes, ""));
 }
 
-/// The memory that the process may take, or on a GPU the policy, wherever one is loaded.
+/// Adds --memory, for each command that loads a policy: the limit for the process, or on a GPU for the policy.
 void add_memory(CLI::App& command, std::size_t& bytes);
 
-/// The views that the robot does not have, wherever a policy is loaded.
+/// Adds --absent, for each command that loads a policy: views that the robot does not have.
 inline CLI::Option* add_absent(CLI::App& command, std::vector<std::string>& views) {
   return command
       .add_option(
@@ -67,11 +67,11 @@ inline CLI::Option* add_absent(CLI::App& command, std::vector<std::string>& view
       ->allow_extra_args(false);
 }
 
-/// Limits of what a chunk may be, wherever chunks are answered.
+/// Adds --limits and --on-limit, for each command that answers chunks.
 CLI::Option* add_limits(CLI::App& command, std::string& file, std::string& on_limit);
 
-/// Replaces a name `hub:OWNER/NAME@REVISION` by the file that vla-pull has put there; other text names a file. What
-/// comes back is the problem, or empty.
+/// Replaces `hub:OWNER/NAME@REVISION` by the file that vla-pull downloaded; other text names a file and stays. Returns
+/// the problem, or empty.
 std::string find_pulled(std::string& bundle);
 
 inline void add_bundle(CLI::App& command, std::string& bundle, bool required) {
@@ -83,7 +83,8 @@ inline void add_bundle(CLI::App& command, std::string& bundle, bool required) {
       ->transform(CLI::Validator([](std::string& text) { return find_pulled(text); }, ""));
 }
 
-/// Adds one subcommand. What it returns is run after parsing; its Status becomes the exit code (base/result.h).
+/// A subcommand, to be run after parsing; its Status becomes the exit code (base/result.h). Each function below adds
+/// one and returns it.
 using Command = std::function<Status()>;
 
 Command add_run(CLI::App& app);

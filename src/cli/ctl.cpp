@@ -16,12 +16,12 @@ struct CtlOptions {
   std::string path, what, policy;
 };
 
-/// NAME=BUNDLE, or a file whose name without `.gguf` is the policy's.
+/// The order to load NAME=BUNDLE, or a file, whose name without `.gguf` is the policy's.
 Result<ordered_json> load_order(const std::string& text) {
   const auto [name, bundle] = serve::named_bundle(text);
   VLA_CHECK(serve::check_policy_name(name));
   std::error_code failed;
-  // The server has a folder of its own; the name of a pulled bundle is no path.
+  // The server may run in another folder, so a path must be absolute; the name of a pulled bundle is no path.
   const std::string absolute = bundle.starts_with("hub:") ? bundle : std::filesystem::absolute(bundle, failed).string();
   if (failed) return Error{Code::io, bundle, "a path", failed.message()};
   return ordered_json{{"do", "load"}, {"policy", name}, {"bundle", absolute}};

@@ -28,7 +28,7 @@ std::string human_size(double bytes) {
   return fmt::format("{:.{}f} {}", bytes, unit == 0 ? 0 : 1, kUnits[unit]);
 }
 
-/// The size of one module of the first two path levels: `vision`, `lm`, `expert`, `action_in`, ...
+/// The size of one module, by the first part of its parameters' names: `vision`, `lm`, `expert`, `action_in`, ...
 struct ModuleSize {
   std::int64_t n_param = 0;
   std::int64_t stored = 0;  // bytes in the file
@@ -44,7 +44,7 @@ std::map<std::string, ModuleSize> module_sizes(const ParamList& params) {
   return sizes;
 }
 
-Json shape_json(const Param& param) {  // as torch writes it, slowest dimension first
+Json shape_json(const Param& param) {  // torch's order, slowest dimension first
   return Json(std::vector<std::int64_t>(param.shape.rbegin(), param.shape.rend()));
 }
 
@@ -71,7 +71,7 @@ Status print_manifest(const std::string& arch) {
   return {};
 }
 
-/// Values of `stats.<feature>.*` beside the names of a feature's elements.
+/// The statistics `stats.<feature>.*` of a feature, one column for each.
 struct StatsColumns {
   std::vector<std::string> names;
   std::vector<std::vector<double>> values;

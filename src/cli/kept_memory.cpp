@@ -9,7 +9,7 @@
 namespace vla::cli {
 namespace {
 
-constexpr std::size_t kLeastBlock = 4 << 20, kMostBlock = 32 << 20;  // bytes of a block; malloc allows no more
+constexpr std::size_t kLeastBlock = 4 << 20, kMostBlock = 32 << 20;  // bytes of a block; malloc's maximum
 constexpr auto kKeptFor = std::chrono::seconds(30);
 
 }  // namespace
@@ -26,13 +26,13 @@ void KeptMemory::answered(const observe::Answered& answered) {
   }
 }
 
-/// A buffer that grows may be twice as large as what is in it.
+/// Keeps blocks of up to twice `size`, since a buffer that grows may be twice as large as its contents.
 void KeptMemory::keep(std::size_t size) {
   kept_ = std::max(size, kLeastBlock / 2);
   const std::size_t block = std::min(2 * kept_, kMostBlock);
   ::mallopt(M_MMAP_THRESHOLD, static_cast<int>(block));
   ::mallopt(M_TRIM_THRESHOLD,
-            static_cast<int>(kept_ > kLeastBlock / 2 ? 2 * block : kLeastBlock));  // an act has a few blocks
+            static_cast<int>(kept_ > kLeastBlock / 2 ? 2 * block : kLeastBlock));  // an act needs a few blocks
 }
 
 }  // namespace vla::cli

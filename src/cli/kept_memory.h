@@ -8,9 +8,9 @@
 
 namespace vla::cli {
 
-/// Decides how much freed memory malloc keeps. By itself it keeps up to 64 MB for each thread that took some, for ever.
-/// Here large blocks go back to the system as soon as they are freed, except for what the answered acts of the last
-/// half minute took: their pages would be made anew for each of them.
+/// Decides how much freed memory malloc keeps. By default malloc keeps up to 64 MB forever for each thread that
+/// allocated some. With this observer, large blocks return to the system as soon as they are freed, except for the size
+/// that the acts of the last half minute took: without that, every act would need new pages.
 class KeptMemory final : public observe::Observer {
  public:
   KeptMemory() { keep(0); }

@@ -40,8 +40,8 @@ int fail(const vla::Error& error) {
   return vla::exit_code(error.code);
 }
 
-/// Reports a wrong call in CLI11's words, in one line and with the help that explains it. A misspelled option is one
-/// too many and often one too few as well; the former says what to mend.
+/// Reports a wrong call in CLI11's words, in one line and with the help that explains it. CLI11 often reports a
+/// misspelled option as a missing one; the unknown word shows what to correct, so it comes first.
 int fail_usage(const CLI::App& app, const CLI::ParseError& parse_error) {
   const auto chosen = app.get_subcommands();
   const std::string command = chosen.empty() ? "vla" : "vla " + chosen.front()->get_name();
@@ -54,14 +54,15 @@ int fail_usage(const CLI::App& app, const CLI::ParseError& parse_error) {
   return fail({vla::Code::usage, "arguments", "", what, meant + "see " + command + " --help"});
 }
 
-/// A script must not take an answer for whole that a full disk or a closed pipe cut off.
+/// Flushes standard output. A script must not mistake output that a full disk or a closed pipe cut off for a whole
+/// answer.
 int finish() {
   if (std::fflush(stdout) == 0 && std::ferror(stdout) == 0) return 0;
   return fail({vla::Code::io, "standard output", "a place that can be written", std::strerror(errno)});
 }
 
-/// A stream that the caller has closed stays unusable: the next file that is opened, maybe a recording, would take its
-/// place and get what is printed.
+/// Occupies each standard stream that the caller has closed, and keeps it unusable. Otherwise the next file that is
+/// opened, such as a recording, would take its place and receive the output.
 void keep_standard_streams() {
   for (const int stream : {STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO})
     if (::fcntl(stream, F_GETFD) < 0) ::open("/dev/null", stream == STDIN_FILENO ? O_WRONLY : O_RDONLY);
@@ -94,7 +95,7 @@ int run(int argc, char** argv) {
 
   vla::cli::format_help(app);
   std::vector<std::string> given = vla::cli::arguments(argc, argv);
-  std::reverse(given.begin(), given.end());  // as CLI11 takes them
+  std::reverse(given.begin(), given.end());  // CLI11 expects the reverse order
   try {
     app.parse(std::move(given));
   } catch (const CLI::ParseError& parse_error) {
@@ -111,7 +112,7 @@ int run(int argc, char** argv) {
 int main(int argc, char** argv) {
   keep_standard_streams();
   std::signal(SIGXFSZ, SIG_IGN);  // a file over the user's limit is an error like a full disk
-  try {                           // what libraries may throw ends here
+  try {                           // catches exceptions of libraries
     return run(argc, argv);
   } catch (const std::bad_alloc&) {
     return fail(

@@ -124,7 +124,7 @@ Status Observability::open(const ObservabilityOptions& options, bool insecure) {
                        options.page, insecure,
                        {drawn_token(), serve::is_same_secret, [this] { return server_.health(); }, recordings_.get()}));
   }
-  // Last, since it makes a file that must not be there.
+  // Last, since it creates a file that must not exist yet.
   return recordings_ && !options.record_paused ? recordings_->open() : Status();
 }
 
@@ -140,7 +140,7 @@ Observability::~Observability() {
   if (trace_ && trace_->n_dropped() > 0) log_.event(Level::warn, "trace_dropped", {{"requests", trace_->n_dropped()}});
 }
 
-/// Requests that come between the ready line and the first turn of the server wait for it: it is ready.
+/// Requests that arrive between the ready line and the server's first turn wait for it, so the server counts as ready.
 std::string Observability::not_ready_reason() const {
   if (const char* phase = phase_) return phase;
   const observe::Health health = server_.health();

@@ -26,42 +26,43 @@ struct ObservabilityOptions {
   bool record_paused = false;
 };
 
-/// What a page asks of who wants to see it: 128 bits of the system's, as hexadecimal digits.
+/// Draws the token that a page requires: 128 random bits from the system, as hexadecimal digits.
 std::string drawn_token();
 
-/// Adds the ranges of a robot's states in training: extremes or, where the bundle has none, three deviations around
-/// the mean. Keys are `tag/state`.
+/// Adds the ranges of a robot's states in training: extremes, else 1 % and 99 % quantiles, else three standard
+/// deviations around the mean. Keys are `tag/state`.
 void add_ranges(const Robot& robot, std::map<std::string, observe::Page::Range>& ranges);
 
-/// How a policy that is loaded is shown: where its states were in training, where its actions may be, and how it sees.
-/// The engine outlives the page.
+/// Describes a loaded policy to the page: training ranges of its states, limits of its actions, and its preprocessing
+/// of frames. The engine must outlive the page.
 void describe_for_page(observe::Page& page, const v1::Description& description, const Engine& engine,
                        const std::optional<control::Limits>& limits);
 
 void add_observability_options(CLI::App& command, ObservabilityOptions& options);
 
-/// Everything that watches a server: what the options ask for, and nothing else. It lives as long as the server runs.
+/// The observers of a server, those that the options ask for. They live as long as the server runs.
 class Observability {
  public:
-  /// Before the bundle is loaded, so that readiness can be polled. Errors: usage, io.
+  /// Call it before the bundle is loaded, so that readiness can be polled. Errors: usage, io.
   static Result<std::unique_ptr<Observability>> start(const ObservabilityOptions& options, const serve::Server& server,
                                                       bool insecure);
   ~Observability();
 
-  /// A policy is loaded that answers under this name; all of them are warm, after so many milliseconds.
+  /// `loaded`: a policy is loaded and answers under this name. `ready`: all policies are warm, after this many
+  /// milliseconds.
   void loaded(const std::string& name, const Engine& engine);
   void ready(double warm_up_ms);
-  /// A protocol lets clients in without keys while the server's own asks for them.
+  /// Logs that a protocol admits clients without keys although the native protocol requires them.
   void without_keys(const char* option, const std::string& address, bool has_token);
-  /// A policy answers no more.
+  /// A policy is unloaded.
   void unloaded(const std::string& name);
-  /// How the server ended. The log says so.
+  /// Logs how the server ended.
   void ended(const Status& status);
 
   std::vector<observe::Observer*> observers();
-  /// The address where HTTP listens; empty where it does not.
+  /// The address where HTTP listens; empty if it does not.
   std::string metrics_address() const { return monitor_ ? monitor_->address() : std::string(); }
-  /// The URL of the page, with its token; empty where there is none.
+  /// The URL of the page, with its token; empty if there is none.
   std::string page_url() const { return page_ ? page_->url() : std::string(); }
 
  private:
@@ -77,7 +78,7 @@ class Observability {
   std::unique_ptr<observe::Trace> trace_;
   std::unique_ptr<observe::Recordings> recordings_;
   std::unique_ptr<observe::Page> page_;
-  std::unique_ptr<observe::Monitor> monitor_;  // last: asks the others
+  std::unique_ptr<observe::Monitor> monitor_;  // last member: its thread uses the others
 };
 
 }  // namespace vla::cli

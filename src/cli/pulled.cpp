@@ -22,7 +22,7 @@ namespace {
 
 namespace fs = std::filesystem;
 
-constexpr std::size_t kMaxName = 512;  // bytes of OWNER/NAME@REVISION; longer than any of the hub
+constexpr std::size_t kMaxName = 512;  // bytes of OWNER/NAME@REVISION; longer than any on the hub
 
 std::string variable(const char* name) {
   const char* value = std::getenv(name);

@@ -21,11 +21,11 @@ namespace {
 struct QuantizeOptions {
   std::string from, to, dtype = "int8";
   bool force = false, quiet = false;
-  std::string recording;    // to judge by
-  std::string calibration;  // to smooth by
+  std::string recording;    // the recording for --judge
+  std::string calibration;  // the recording for --calibrate
   Bound bound;
   int n_observation = 32;
-  EngineOptions engine = {.all_robots = true};  // that observations are computed by
+  EngineOptions engine = {.all_robots = true};  // computes the observations
 };
 
 std::string megabytes(std::int64_t bytes) { return fmt::format("{:.1f}", static_cast<double>(bytes) / 1e6); }
@@ -50,7 +50,7 @@ void print(const std::vector<QuantizedModule>& rows) {
       megabytes(all.after));
 }
 
-/// One line that is written over, where somebody looks.
+/// Prints the progress on one line of a terminal, over the last value.
 void print_progress(QuantizeProgress at) {
   static std::int64_t shown = -1;
   const std::int64_t percent = 100 * at.done / std::max<std::int64_t>(at.all, 1);
@@ -86,7 +86,7 @@ void print(const Found& found, std::size_t n_observation) {
       "200 episodes in both, and 182 in float32; beyond that, try it in closed loop\n\n");
 }
 
-/// The text about a search that the bundle keeps.
+/// The text about a search; the bundle stores it.
 std::string told(const Found& found, const QuantizeOptions& options, std::size_t n_observation) {
   const auto n = [&](Rounding codes) { return std::ranges::count(found.blocks, codes, &Block::codes); };
   const std::string bound = options.bound.error ? fmt::format("error at most {}", *options.bound.error)
@@ -100,7 +100,7 @@ Result<std::vector<Judged>> observations(const QuantizeOptions& options, const s
   return read_observations(recording, options.from, static_cast<std::size_t>(options.n_observation));
 }
 
-/// Codes block by block, and why.
+/// Chooses codes block by block. Returns them with the text that explains them.
 Result<std::pair<Choice, std::string>> choose(const QuantizeOptions& options, const CodeSource& source, bool shows) {
   VLA_TRY(const std::vector<Judged> judged, observations(options, options.recording));
   const auto progress = [shows](int trial, const Moved& moved) {
@@ -189,8 +189,8 @@ Status calibrate_first(QuantizeOptions options) {
   return write_codes(options, source, made.why);
 }
 
-/// The bundles that are made on the way, beside the result: gone before it begins, since a program that was killed may
-/// have left some, at its end, and where a signal ends it.
+/// The temporary bundles beside the result. They are removed at the start, since a killed program may have left some,
+/// at the end, and when a signal ends the program.
 class Trials {
  public:
   explicit Trials(const std::string& to) {
@@ -218,7 +218,7 @@ class Trials {
   static void remove() {
     for (const std::string& file : files_) ::unlink(file.c_str());
   }
-  static inline std::vector<std::string> files_;  // which do not change any more once a signal may come
+  static inline std::vector<std::string> files_;  // constant once a signal may arrive
 };
 #endif
 

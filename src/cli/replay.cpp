@@ -29,7 +29,8 @@ struct ReplayOptions {
   observe::ReplayOptions replay;
 };
 
-/// Another bundle or other arithmetic may rightly give other answers, so the table says so.
+/// Prints how the replaying server differs from the recorded one: another bundle or other arithmetic may rightly give
+/// other answers.
 void announce(const v1::Description& recorded, const v1::Description& replayed) {
   const auto row = [](const char* what, const std::string& before, const std::string& now) {
     if (before != now) say(stdout, "note: {} was {} when recorded, is {} now\n", what, before, now);
@@ -56,7 +57,8 @@ Status report(const observe::Recording& recording, const observe::ReplayReport& 
                fmt::format("{} answers differ; this is the first", report.n_different)};
 }
 
-/// The limits that the requests were recorded under, which are some that `vla serve` takes.
+/// Returns the server options with the limits under which the requests were recorded. Errors: bad_request if `vla
+/// serve` does not accept these limits.
 Result<serve::ServerOptions> limits_of(const v1::Limits& limits) {
   constexpr std::uint64_t kMiB = 1 << 20, kMostMessage = 1024 * kMiB, kMostPixels = 1 << 28, kMostText = kMiB;
   if (limits.max_message_bytes() < kMiB || limits.max_message_bytes() > kMostMessage ||
@@ -97,8 +99,8 @@ Result<observe::ReplayReport> replay_bundle(observe::Recording& recording, Repla
   return std::move(*result);
 }
 
-/// The recorded policy's bundle, of which only the way in is needed: what it makes of frames, and where its states were
-/// in training. Errors: usage for another bundle, which would not have seen the same.
+/// Opens the recorded policy's bundle without loading weights: the page needs only its preprocessing and normalization
+/// statistics. Errors: usage for another bundle, which may preprocess frames differently.
 Result<std::unique_ptr<Engine>> open_recorded(const v1::Description& recorded, const ReplayOptions& options) {
   VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
                                                                         .kernels = options.kernels,
@@ -113,7 +115,7 @@ Result<std::unique_ptr<Engine>> open_recorded(const v1::Description& recorded, c
   return engine;
 }
 
-/// Shows the recording at the pace at which it came, and its acts until the process is ended.
+/// Shows the recording at its own pace, then keeps its acts on the page until the process ends.
 Status show(observe::Recording& recording, const ReplayOptions& options) {
   std::atomic<std::uint64_t> n_shown = 0;
   const auto health = [&n_shown] { return observe::Health{.ready = true, .n_chunk = n_shown}; };

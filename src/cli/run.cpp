@@ -47,7 +47,7 @@ Result<std::vector<float>> parse_numbers(const std::string& text) {
   std::vector<float> values;
   for (const char *at = text.data(), *end = at + text.size(); at != end;) {
     while (at != end && *at == ' ') ++at;
-    double value;  // a float32 reader would refuse 1e-60 as out of range; narrowed it is the zero that is meant
+    double value;  // parsed as float32, 1e-60 would be out of range; as double it becomes the zero that is meant
     const auto [next, error] = std::from_chars(at, end, value);
     if (error != std::errc() || (next != end && *next != ',') || (next != end && next + 1 == end))
       return Error{Code::usage, "--state", "numbers separated by commas", text};
@@ -86,7 +86,7 @@ Status add_state(Observation& observation, const std::string& argument, const Pr
   return {};
 }
 
-/// Float32 rows; the reference's own arrays have a batch of one before them.
+/// Reads float32 rows. The reference's own arrays have a leading batch dimension of one, which is dropped.
 Result<NpyArray> read_rows(const std::string& file, const std::string& where) {
   VLA_TRY(const std::vector<std::byte> bytes, read_file(file, kMaxFile));
   VLA_TRY(NpyArray array, parse_npy(bytes, where));
@@ -236,7 +236,8 @@ Status run(RunOptions& options) {
   return {};
 }
 
-/// CLI11 wraps -1 around and reads an empty text as nothing given; a seed of either would be a guess.
+/// Refuses -1, which CLI11 would wrap around, and empty text, which it would read as not given: neither may become a
+/// seed.
 std::string check_seed(const std::string& text) {
   std::uint64_t seed;
   const char* const end = text.data() + text.size();

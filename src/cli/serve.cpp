@@ -41,12 +41,12 @@ struct ServeOptions {
   ObservabilityOptions observability;
 };
 
-constexpr std::chrono::milliseconds kLoadPatience(500);  // with an order to load, at the end
+constexpr std::chrono::milliseconds kLoadPatience(500);  // at the end, for an order that loads a policy
 
 serve::Server* stopped_by_signals = nullptr;
 
-/// The first SIGTERM, SIGINT or SIGHUP lets the server finish; the next one, whichever it is, ends the process. A
-/// hangup that whoever started the program ignores, as nohup does, stays ignored.
+/// The first SIGTERM, SIGINT or SIGHUP lets the server finish; the next one, whichever it is, ends the process. SIGHUP
+/// stays ignored if the parent process ignores it, as nohup does.
 void stop_on_signals(serve::Server& server) {
   stopped_by_signals = &server;
   struct sigaction action = {};
@@ -64,7 +64,7 @@ void stop_on_signals(serve::Server& server) {
   if (hangup.sa_handler != SIG_IGN) sigaction(SIGHUP, &action, nullptr);
 }
 
-/// As a shell reads it back: words as they are, anything else in quotes.
+/// Quotes a value for a shell; plain words stay unquoted.
 std::string quoted(const std::string& value) {
   const std::string text = printable(value);
   const auto is_plain = [](unsigned char c) { return std::isalnum(c) != 0 || std::strchr("@%+=:,./-_", c) != nullptr; };
@@ -111,7 +111,7 @@ void add_policy(Line& line, const serve::LoadedPolicy& policy) {
 
 /// Adds the facts that a user has to know before the policy moves a robot.
 void add_features(Line& line, const serve::LoadedPolicy& policy) {
-  std::vector<std::string> features, degraded, constant;  // of all robots
+  std::vector<std::string> features, degraded, constant;  // collected over all robots
   const auto add_new = [](std::vector<std::string>& all, const std::vector<std::string>& some) {
     for (const std::string& text : some)
       if (!text.empty() && std::find(all.begin(), all.end(), text) == all.end()) all.push_back(text);
@@ -126,7 +126,7 @@ void add_features(Line& line, const serve::LoadedPolicy& policy) {
   line.add("warm_up_ms", fmt::format("{:.1f}", policy.warm_up_ms)).add("CONSTANT", constant).add("DEGRADED", degraded);
 }
 
-/// Prints for several policies a line each, and then one of the server; for one a single line.
+/// Prints a single line for one policy. For several, prints one line each, then one for the server.
 void print_ready(const serve::Server& server, const std::map<std::string, serve::LoadedPolicy>& policies,
                  const ServeOptions& options, const Observability& observability) {
   const bool is_one = policies.size() == 1;
@@ -153,8 +153,8 @@ void print_ready(const serve::Server& server, const std::map<std::string, serve:
   line.print();
 }
 
-/// The program in place of this process, with the same arguments: a driver that has lost its device finds it again in
-/// no other way. Returns where that fails.
+/// Runs the program again in place of this process, with the same arguments: a driver finds a lost device again in no
+/// other way. Returns only if that fails.
 Error start_again() {
   std::error_code failed;
   const std::string program = std::filesystem::read_symlink("/proc/self/exe", failed);
@@ -164,7 +164,7 @@ Error start_again() {
   std::vector<char*> pointers;
   for (std::string& argument : arguments) pointers.push_back(argument.data());
   pointers.push_back(nullptr);
-  for (const auto& entry : std::filesystem::directory_iterator("/proc/self/fd", failed))  // those of drivers
+  for (const auto& entry : std::filesystem::directory_iterator("/proc/self/fd", failed))  // drivers' descriptors
     if (const int fd = std::atoi(entry.path().filename().c_str()); fd > STDERR_FILENO) ::fcntl(fd, F_SETFD, FD_CLOEXEC);
   ::execv(program.c_str(), pointers.data());
   return {Code::io, program, "a program that starts again", std::strerror(errno)};
@@ -188,7 +188,7 @@ Result<serve::LoadedPolicy> load_policy(const ServeOptions& options, std::string
   return policy;
 }
 
-/// Recordings and the page are of one policy, which stays the same.
+/// Checks that recordings and the page get a single policy, which stays the same.
 Status check_single(const ServeOptions& options) {
   const char* of_one = !options.observability.record.empty() ? "--record"
                        : !options.observability.page.empty() ? "--page"
@@ -211,14 +211,14 @@ Result<std::map<std::string, std::string>> named_bundles(const std::vector<std::
   return bundles;
 }
 
-/// Ends the process with success, since a bundle that is being loaded cannot be told to stop. Log, trace and recordings
-/// are closed first.
+/// Ends the process with success, since the loading of a bundle cannot be interrupted. Log, trace and recordings are
+/// closed first.
 [[noreturn]] void end_while_loading(std::unique_ptr<Observability>& observability) {
   observability.reset();
   std::_Exit(0);
 }
 
-/// Tells of doors that let everybody in while the server's own protocol has keys.
+/// Warns of protocols that admit everybody although the native protocol has keys.
 void warn_of_doors_without_keys(const serve::ServerOptions& server, Observability& observability) {
   if (server.curve_secret.empty()) return;
   for (const auto& [option, address] : {std::pair{"--openpi", &server.openpi}, std::pair{"--gr00t", &server.gr00t},
@@ -228,7 +228,7 @@ void warn_of_doors_without_keys(const serve::ServerOptions& server, Observabilit
   }
 }
 
-/// `ready`: whether it came as far as that.
+/// `ready`: set once the server is ready.
 Status serve(ServeOptions& options, bool& ready) {
   KeptMemory memory;
   VLA_CHECK(check_single(options));
@@ -276,7 +276,7 @@ Status serve(ServeOptions& options, bool& ready) {
   stop_on_signals(*server);
   observability->ready(warm_up_ms);
   print_ready(*server, policies, options, *observability);
-  policies.clear();  // the server's alone, so that one that is taken away is gone
+  policies.clear();  // only the server keeps them, so that an unloaded policy is freed
   if (control) VLA_CHECK(control->start());
   ready = true;
   std::vector<serve::Observer*> observers = observability->observers();
@@ -287,7 +287,7 @@ Status serve(ServeOptions& options, bool& ready) {
   return status;
 }
 
-/// What a server may do with rows outside of the limits; the problem, or empty.
+/// Checks the value of --on-limit. Returns the problem, or empty.
 std::string check_on_limit(const std::string& given) {
   if (given == "note" || given == "refuse") return {};
   return given == "clamp"
@@ -296,7 +296,7 @@ std::string check_on_limit(const std::string& given) {
              : "expected note or refuse, found " + given;
 }
 
-/// Adds the options that let clients of other servers in as they are.
+/// Adds the options for clients of other servers' protocols.
 void add_other_protocols(CLI::App& command, serve::ServerOptions& server) {
   add_text(command, "--openpi", server.openpi, "ADDRESS:PORT",
            "Answer openpi's clients too: WebSocket (docs/drop_in.md)");

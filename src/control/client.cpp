@@ -1,8 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// A policy at `vla serve` (docs/protocol.md). A thread has the socket. It and the robot's thread share one slot: an
-// observation on its way out, then an answer on its way in. `phase` says whose it is, so neither waits for the other.
+// A policy at `vla serve` (docs/protocol.md). The client's own thread owns the socket. It shares one slot with the
+// robot's thread: first an observation to send, then its answer. `phase` tells which thread may use the slot, so that
+// neither waits for the other.
 #include <fmt/format.h>
 #include <pthread.h>
 #include <sys/eventfd.h>
@@ -31,8 +32,8 @@ constexpr int kHeartbeatMs = 1000, kReconnectMs = 100, kMaxWaiting = 8;
 constexpr float kFarAction = 1e6f, kMaxAction = 4294967296.0f;  // python/vla_cpp/answer.py says why
 constexpr std::uint32_t kMaxSize = 1 << 16, kMaxColumns = 1 << 12;
 
-/// idle: nobody's. filled: the socket's thread reads the observation. sent: it waits for the answer. answered: the
-/// robot's thread reads the answer.
+/// idle: no thread uses the slot. filled: the socket's thread reads the observation. sent: it waits for the answer.
+/// answered: the robot's thread reads the answer.
 enum class Phase : int { idle, filled, sent, answered };
 
 Problem problem_of(std::string_view code, const std::string& where, const std::string& expected,
@@ -48,8 +49,8 @@ Problem problem_of(const v1::Error& error) {
   return problem_of(code_name(wire::code_of(error.code())), text[0], text[1], text[2], text[3]);
 }
 
-/// A DEALER socket, and a monitor that reports when the server disconnects. It is never repaired: after a loss a new
-/// one is made, so that nothing meant for an earlier request comes out of it.
+/// A DEALER socket, and a monitor that reports when the server disconnects. It is not used again after a loss: a new
+/// one replaces it, so that it cannot deliver an answer to an earlier request.
 class Connection {
  public:
   Connection(zmq::context_t& context, const std::string& address, const ClientOptions& options)
@@ -96,7 +97,7 @@ class Connection {
   zmq::socket_t socket_, monitor_;
 };
 
-/// What a policy takes and gives. Errors: incompatible, usage.
+/// Reads the spec of a policy from its description. Errors: incompatible, usage.
 Spec spec_of(const v1::Description& whole, const std::string& embodiment, const std::string& address) {
   const v1::Description* robot = &whole;
   std::string tags;
@@ -161,7 +162,7 @@ void add(v1::Act& act, const Frame& frame) {
   }
 }
 
-/// Why a frame is none; empty where it is.
+/// Says why a frame is invalid; empty for a valid frame.
 std::string wrong(const Frame& frame) {
   const std::int64_t size = std::int64_t{3} * frame.width * frame.height;
   if (frame.width < 0 || frame.height < 0) return fmt::format("{} x {}", frame.width, frame.height);
@@ -185,16 +186,16 @@ struct Client::Impl {
   std::atomic<bool> is_stopping = false;
 
   std::atomic<Phase> phase = Phase::idle;
-  const Observation* observation = nullptr;  // of the robot's thread; read in the phase `filled`
+  const Observation* observation = nullptr;  // the robot's thread owns it; read in the phase `filled`
   std::vector<float> leftover;
   Leftover how;
   bool has_leftover = false;
-  Answer answer;  // of the robot's thread in the phase `answered`
+  Answer answer;  // the robot's thread reads it in the phase `answered`
   std::vector<float> rows, normalized;
 
-  // Of the socket's thread.
+  // For the socket's thread only.
   v1::Request request;
-  std::uint64_t last_id = std::random_device()(), waits_for = 0;  // 0: for nothing
+  std::uint64_t last_id = std::random_device()(), waits_for = 0;  // awaited request; 0: none
   std::optional<std::uint64_t> seed;
   bool takes_loop = false;  // the server knows Act.loop
   Clock::time_point until;
@@ -220,10 +221,9 @@ struct Client::Impl {
     [[maybe_unused]] const auto written = write(wake, &one, sizeof one);
   }
 
-  // --- the socket's thread
-  // ---------------------------------------------------------------------------------------------
+  // --- the socket's thread -------------------------------------------------------------------------------------------
 
-  /// Greets, and asks for the description. Errors: usage, for an address that is none.
+  /// Connects, sends a hello and asks for the description. Errors: usage, for an invalid address.
   void connect() {
     takes_loop = false;
     try {
@@ -311,7 +311,7 @@ struct Client::Impl {
   }
 
   void send() {
-    waits_for = 0;  // a request that was abandoned
+    waits_for = 0;  // forgets a request that was abandoned
     Problem problem;
     if (!connection) {
       try {
@@ -395,14 +395,14 @@ struct Client::Impl {
       return drop(problem_of("incompatible", address, "the policy that was there before: " + spec.bundle,
                              printable(bundle->name()), "make a new Client, and read its spec"));
     if (response.has_hello()) return greet(response.hello());
-    if (waits_for == 0 || response.request_id() != waits_for) return;  // a greeting's, or nobody waits for it
+    if (waits_for == 0 || response.request_id() != waits_for) return;  // for a greeting, or for an abandoned request
     if (response.has_error()) return finish(problem_of(response.error()));
     if (!response.has_chunk())
       return finish(problem_of("incompatible", address, "an action chunk", "an answer of another kind"));
     finish(read_chunk(response.chunk()));
   }
 
-  /// Takes rows and notes of a chunk that goes with what was asked.
+  /// Takes rows and notes of a chunk. Returns a problem if the chunk does not fit the request.
   Problem read_chunk(const v1::ActionChunk& chunk) {
     const auto n = static_cast<std::size_t>(spec.horizon) * static_cast<std::size_t>(spec.d_action);
     const auto wrong = [&](const std::string& what, const std::string& expected, const std::string& found) {
@@ -451,7 +451,7 @@ struct Client::Impl {
     answer.problem = problem;
     answer.horizon = spec.horizon, answer.d_action = spec.d_action;
     answer.rows = rows, answer.normalized = normalized;
-    Phase sent = Phase::sent;  // another one where the robot's thread has abandoned it
+    Phase sent = Phase::sent;  // another phase if the robot's thread has abandoned it
     phase.compare_exchange_strong(sent, Phase::answered, std::memory_order_acq_rel);
     phase.notify_all();
   }
@@ -500,7 +500,7 @@ void Client::wait() noexcept {
 
 void Client::abandon() noexcept {
   std::atomic<Phase>& phase = impl_->phase;
-  for (Phase now = phase.load(); now == Phase::filled; now = phase.load()) phase.wait(now);  // it reads the frames
+  for (Phase now = phase.load(); now == Phase::filled; now = phase.load()) phase.wait(now);  // frames are still read
   phase.store(Phase::idle);
 }
 

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// As python/vla_cpp/control/interpolate.py, which explains it, within the rounding of double.
+// The formulas of python/vla_cpp/control/interpolate.py, which explains them. Both agree within the rounding of double.
 #include <fmt/format.h>
 #include <vla/control.h>
 
@@ -11,8 +11,8 @@
 namespace vla::control {
 namespace {
 
-/// Coefficients of s^0 ... s^5, s from 0 to 1 over a period, from place, velocity and acceleration at 0, and the same
-/// at 1.
+/// Maps place, velocity and acceleration at s = 0, and the same at s = 1, to the coefficients of s^0 ... s^5. s goes
+/// from 0 to 1 over a period.
 constexpr double kPowers[3][6][6] = {
     {{1, 0, 0, 0, 0, 0}, {-1, 0, 0, 1, 0, 0}},
     {{1, 0, 0, 0, 0, 0}, {0, 1, 0, 0, 0, 0}, {-3, -2, 0, 3, -1, 0}, {2, 1, 0, -2, 1, 0}},

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// As python/vla_cpp/control/limits.py, which explains it, operation by operation: both give the same bytes.
+// The operations of python/vla_cpp/control/limits.py, which explains them, in the same order: both give the same bytes.
 #include <fmt/format.h>
 #include <vla/control.h>
 
@@ -12,8 +12,8 @@
 namespace vla::control {
 namespace {
 
-constexpr int kHalf = 16;         // halvings, at most, of the search for a permitted command
-constexpr int kMostSteps = 8191;  // of the longest stop that is looked for
+constexpr int kHalf = 16;         // maximum halvings in the search for a permitted command
+constexpr int kMostSteps = 8191;  // steps of the longest stop that is considered
 constexpr double kUnlimited = 1e9, kSlack = 1e-9, kRounding = 1e-12;
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
@@ -53,7 +53,7 @@ Limiter::Limiter(const Limits& limits, double rate_hz) : refuse_above_(limits.re
     const double acceleration = column.acceleration.value_or(kInfinity) * (first / rate_hz);
     const double jerk = column.jerk.value_or(kInfinity) * (first / (rate_hz * rate_hz));
     m.low = m.is_place ? low : -kInfinity, m.high = m.is_place ? high : kInfinity;
-    // Where a limit is missing, one that the others imply: none of these is ever reached.
+    // A missing limit gets a value that the other limits imply, so that it is never reached.
     const double step = std::min(velocity, m.is_place ? std::max(high - low, 0.0) : kUnlimited);
     m.slowest = m.is_place ? -step : std::max(low, -step);
     m.fastest = m.is_place ? step : std::min(high, step);
@@ -99,8 +99,8 @@ void Limiter::still(std::span<float> out) const noexcept {
     out[i] = motions_[i].is_gripper ? static_cast<float>(motions_[i].place) : 0.0f;
 }
 
-/// Finds the least number of steps of a stop, and its share: false beyond kMostSteps. A stop of n steps is one of n + 1
-/// too, so it looks near the one found before first.
+/// Finds the smallest number of steps of a stop, and its share. Returns false beyond kMostSteps. If n steps suffice, n
+/// + 1 do too, so the search begins near the previous result.
 bool Limiter::find_steps(Motion& m, double velocity, Stop& stop) noexcept {
   const double slack = kSlack * (1 + std::abs(velocity)), change = stop.change;
   double least = 0, most = 0;  // sums of the least and of the largest accelerations
@@ -124,24 +124,25 @@ bool Limiter::find_steps(Motion& m, double velocity, Stop& stop) noexcept {
     const int middle = few + (many - few) / 2;
     (is_enough(middle) ? many : few) = middle;
   }
-  is_enough(many);  // its sums
+  is_enough(many);  // sets `least` and `most` for it
   m.n_stop = stop.n = many;
   const double room = most - least;
   stop.share = clip(room > 0 ? (-velocity - least) / room : 0, 0, 1);
   return true;
 }
 
-/// Looks for the shortest stop after a step with this acceleration: false where none keeps the limits.
+/// Finds the shortest stop after a step with this acceleration. Returns false if none keeps the limits.
 bool Limiter::find_stop(Motion& m, double change, Stop& stop) noexcept {
   const double velocity = m.velocity + change, place = m.is_place ? m.place + velocity : 0;
   const double slack = kSlack * (1 + std::abs(m.fastest)), edge = kSlack * (1 + (m.is_place ? std::abs(place) : 0.0));
   const double slowest = m.slowest - slack, fastest = m.fastest + slack;
-  const double least = m.low - edge, largest = m.high + edge;  // infinite where the value is no place
+  const double least = m.low - edge, largest = m.high + edge;  // infinite unless the value is a position
   stop.change = change;
   if (velocity < slowest || velocity > fastest || place < least || place > largest) return false;
   if (!find_steps(m, velocity, stop)) return false;
-  // Accelerations of a stop change their sign once at most, from that of `change` to the other. After that, or without
-  // that, the speed falls to zero: no later one is larger, and the way that is left is at most that of this speed.
+  // The accelerations of a stop change sign at most once, to the opposite of `change`. After that, or if they never do,
+  // the speed falls to zero: no later speed is larger, and the remaining way is at most the remaining steps at the
+  // current speed.
   const bool is_straight = change * (2 * stop.share - 1) >= 0;
   const double n = stop.n, most = m.acceleration, jerk = m.jerk, share = stop.share;
   double steps = 0, speeds = 0;
@@ -172,7 +173,7 @@ double Limiter::step_column(Motion& m, double wanted) noexcept {
   const double target = is_inside ? change : clip(change, std::min(low, kept), std::max(high, kept));
   double best = target;
   bool is_found = find_stop(m, target, stop);
-  if (!is_found) {  // as near to it as a search by halves finds; in the worst case the next step of the kept stop
+  if (!is_found) {  // bisects between the next step of the kept stop, which is the worst result, and `target`
     const double still = m.is_place ? ahead : m.velocity;
     const auto command = [&](double step) { return static_cast<float>(still + step); };
     double near = 0, far = 1, beyond = target;  // `beyond`: the nearest one that has no stop
@@ -230,7 +231,7 @@ int Limiter::breaks(std::span<const float> rows, int& first) noexcept {
       const double place = value(row, i), moved = m.is_place ? place - before.place : place;
       const double velocity = m.is_gripper ? 0 : moved;
       const double change = velocity - before.velocity, rounding = m.rounding;
-      const std::size_t known = m.is_place ? 2 : 1;  // row that has an acceleration: two velocities before it are known
+      const std::size_t known = m.is_place ? 2 : 1;  // first row with an acceleration, which needs two velocities
       is_broken |= (m.is_place || m.is_gripper) && (place < m.low - rounding || place > m.high + rounding);
       is_broken |= velocity < m.slowest - rounding || velocity > m.fastest + rounding;
       is_broken |= row >= known && std::abs(change) > m.acceleration + 2 * rounding;

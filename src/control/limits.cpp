@@ -18,7 +18,7 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 constexpr const char* kFormat = "vla-limits 1";
-constexpr double kFar = 1e9;  // the largest number of a file
+constexpr double kFar = 1e9;  // largest number in a file
 constexpr int kMaxDepth = 8;
 constexpr std::size_t kMaxFile = 1 << 20, kShown = 80;
 constexpr const char* kKinds[] = {"position", "velocity", "difference", "gripper"};
@@ -38,7 +38,7 @@ double number(const std::string& where, const Json& value) {
   return value.get<double>();
 }
 
-/// JSON whose objects have each name once.
+/// Parses JSON. Each object must have each name once.
 Json parsed(std::string_view text) {
   std::vector<std::set<std::string>> names;
   std::string twice;

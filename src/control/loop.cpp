@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// As python/vla_cpp/control/loop.py: asks a policy, keeps the time.
+// Asks the policy and keeps the time, like python/vla_cpp/control/loop.py.
 #include <fmt/format.h>
 
 #include <algorithm>
@@ -19,7 +19,7 @@ double monotonic_seconds() { return std::chrono::duration<double>(Clock::now().t
 
 void sleep_seconds(double seconds) { std::this_thread::sleep_for(std::chrono::duration<double>(seconds)); }
 
-/// Problems that another observation may survive. All others would come again.
+/// Whether another observation may succeed after this problem. Any other problem would recur.
 bool is_passing(const Problem& problem) {
   for (const char* code : {"busy", "disconnected", "late", "shutting_down", "superseded", "timeout"})
     if (problem.is(code)) return true;
@@ -91,7 +91,7 @@ struct ChunkLoop::Impl {
                   .max_jump = options.max_jump,
                   .limiter = limiter ? &*limiter : nullptr}) {}
 
-  /// The control period that it is. A caller that is early gets the next one; one that is late has missed some.
+  /// Returns the current control period. An early caller gets the next one; a late caller has missed some.
   std::int64_t now() {
     const double seconds = options.clock();
     if (!start) start = seconds - static_cast<double>(tick + 1) / options.rate_hz;
@@ -117,7 +117,7 @@ struct ChunkLoop::Impl {
     return stats;
   }
 
-  /// False where `last` is a problem that another observation would have again.
+  /// Returns false if `last` is a problem that would recur with another observation.
   bool collect(std::int64_t at) {
     const Answer* answer = is_waiting ? policy.poll() : nullptr;
     if (answer == nullptr) return true;

@@ -167,7 +167,7 @@ Action Schedule::hold(std::int64_t tick) noexcept {
   return may_act(tick, action) ? held(tick) : action;
 }
 
-/// Begins the tick's action. False for a loop that was stopped, or whose limiter does not know where the robot is.
+/// Begins the tick's action. Returns false if the loop is stopped, or if the limiter does not know where the robot is.
 bool Schedule::may_act(std::int64_t tick, Action& action) noexcept {
   begin(tick);
   action.problem = &stop_;
@@ -182,8 +182,8 @@ bool Schedule::may_act(std::int64_t tick, Action& action) noexcept {
   return true;
 }
 
-/// The weighted sum of the sources' rows for this step; of a gripper the newest one's value, since half of two
-/// decisions is none.
+/// Writes the weighted sum of the sources' rows for this step. A gripper takes the newest source's value: a mean of
+/// opening and closing is neither.
 void Schedule::mix(std::span<float> row) const noexcept {
   for (std::size_t column = 0; column < row.size(); ++column) {
     const bool is_gripper = options_.limiter != nullptr && options_.limiter->is_gripper(column);
@@ -199,7 +199,8 @@ void Schedule::mix(std::span<float> row) const noexcept {
   }
 }
 
-/// Chunks without a row for now are forgotten; a held command only fades, and is nothing to go on with.
+/// Drops sources that have no admissible row for this tick. A held command only serves to fade out: without a chunk it
+/// is dropped too.
 void Schedule::begin(std::int64_t tick) noexcept {
   bool has_chunk = false;
   std::size_t n = 0;
@@ -219,7 +220,8 @@ bool Schedule::is_admissible(std::int64_t step, std::int64_t observed, int n_row
 
 Schedule::Source& Schedule::add_source() noexcept { return sources_[order_[n_source_++]]; }
 
-/// Steps of a fade that begins now: not more than what fades out has left. After a hold, that is the held command.
+/// Returns the steps of a fade that begins now, at most the steps that the source to fade out has left. After a hold,
+/// the held command becomes that source.
 int Schedule::make_fade(std::int64_t tick) noexcept {
   std::int64_t fade = options_.blend.fade_steps_;
   if (n_source_ > 0) {

@@ -9,15 +9,15 @@
 
 namespace vla::control {
 
-/// Writes a text into a problem, cut to its memory.
+/// Writes a text into a problem, cut to its size.
 void tell(Problem& problem, std::string_view code, const char* format, ...) noexcept
     __attribute__((format(printf, 3, 4)));
 
 /// The rules of a control loop, as python/vla_cpp/control/schedule.py explains them: a state machine without clock,
-/// thread or socket. Memory for all chunks that may overlap is taken once.
+/// thread or socket. It allocates memory once, for all chunks that may overlap.
 class Schedule {
  public:
-  /// Ticks, or -1 where any age is admitted.
+  /// `max_age` is in ticks; -1 admits any age.
   struct Options {
     int horizon = 0, d_action = 0, replan_every = 0;
     Blend blend;
@@ -34,24 +34,24 @@ class Schedule {
   bool wants(std::int64_t tick) noexcept;
   void observe(std::int64_t tick) noexcept;
   void fail() noexcept;
-  /// False, and `problem`, for a chunk of another shape, with a number that is not finite, or too many of whose rows
-  /// break a limit; nothing of it is used. One that came too late is dropped and counted.
+  /// Takes a chunk. Returns false, sets `problem` and uses nothing of the chunk if it has another shape, a number that
+  /// is not finite, or too many rows that break a limit. A chunk that arrives too late is dropped and counted.
   bool receive(const Answer& answer, std::int64_t tick, Problem& problem) noexcept;
-  /// `human`: what a person commands instead; empty for the policy's.
+  /// `human`: a person's command, which replaces the policy's; empty for the policy's.
   Action next(std::int64_t tick, std::span<const float> human) noexcept;
-  /// As `next` where no chunk has a row.
+  /// The same as `next` if no chunk has a row.
   Action hold(std::int64_t tick) noexcept;
-  /// Chunks, and the observation under way, are not used any more. The last command stays.
+  /// Discards the chunks and the observation under way. The last command stays.
   void forget_chunks() noexcept { n_source_ = 0, is_flying_ = false; }
 
-  /// The next rows of the newest chunk, at most n_row, as its network answered them.
+  /// Returns the next rows of the newest chunk, at most n_row, as the network's normalized output.
   std::span<const float> leftover(int n_row) const noexcept;
   int delay() const noexcept;
 
   LoopStats counts;
 
  private:
-  static constexpr int kDelays = 16;  // inferences that an estimate of the delay looks back on
+  static constexpr int kDelays = 16;  // latest inferences that determine the delay
   /// Rows that may be commanded; row i is meant for step `step + i`. A held command is one row, repeated.
   struct Source {
     std::int64_t step = 0, tick = -1, entered = 0;

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-// The kernels' PTX and machine code from the build, as bytes in the library: embedded_modules.inc lists the files.
+// Embeds the kernels' PTX and machine code in the library; the build writes the list of files, embedded_modules.inc.
 #include "cuda/driver/modules.h"
 
 #define IMAGE(name, file)                                                                                        \

@@ -34,7 +34,8 @@ Result<std::vector<DeviceInfo>> list(const std::string& library) {
   return loaded->list();
 }
 
-/// The name of the library with ggml's backend, for a kind that has a library of our own kernels too.
+/// The name of the library for a kind of device and a backend: CUDA has one library for our own kernels and one for
+/// ggml's backend.
 std::string library_of(const std::string& kind, Arithmetic::Backend backend) {
   return kind == "cuda" && backend == Arithmetic::Backend::ggml ? "cuda-ggml" : kind;
 }

@@ -14,11 +14,11 @@ namespace kernels {
 class Executor;
 }
 
-/// Threads of the host that prepare what another device computes. Idle ones sleep.
+/// Host threads that prepare the inputs of another device. Idle threads sleep.
 class HostThreads {
  public:
-  /// At most eight, since more of them wait for memory; n_thread: the most, 0 for every core that the process may use.
-  /// Errors: device if the system refuses a thread.
+  /// Starts at most eight threads, since more of them wait for memory. n_thread: the maximum; 0: every core that the
+  /// process may use. Errors: device if the system refuses a thread.
   static Result<HostThreads> start(int n_thread);
   HostThreads() = default;
 
@@ -27,7 +27,7 @@ class HostThreads {
   void run(std::size_t n, const std::function<void(std::size_t)>& item) const;
 
  private:
-  std::shared_ptr<kernels::Executor> executor_;  // shared by all of as many threads; null: the caller alone
+  std::shared_ptr<kernels::Executor> executor_;  // shared by all users of this many threads; null: no threads
 };
 
 }  // namespace vla

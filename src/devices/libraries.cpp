@@ -25,7 +25,7 @@ fs::path own_file() {
   link_map* map = nullptr;
   const bool found =
       dladdr1(reinterpret_cast<void*>(&own_file), &info, reinterpret_cast<void**>(&map), RTLD_DL_LINKMAP) != 0;
-  std::error_code error;  // the linker lists the program without a name
+  std::error_code error;  // the dynamic linker lists the program with an empty name
   return fs::canonical(found && map->l_name[0] != '\0' ? map->l_name : "/proc/self/exe", error);
 }
 

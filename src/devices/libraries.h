@@ -6,9 +6,9 @@
 
 namespace vla {
 
-/// Loads a library of devices once and keeps it: libvla-NAME.so, where NAME is vulkan, cuda or cuda-ggml. It is
-/// searched beside the running code (program or libvla.so) and in the library folder beside that. Errors: device, with
-/// the reason as `found`.
+/// Loads a library of devices once and keeps it: libvla-NAME.so, where NAME is vulkan, cuda or cuda-ggml. Searches the
+/// folder of the running code (program or libvla.so), then the library folders next to it. Errors: device, with the
+/// reason as `found`.
 Result<const DeviceLibrary*> device_library(const std::string& kind);
 
 }  // namespace vla

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// What calls are answered with: one gRPC message, or a status with its words.
+// Answers to calls: one gRPC message, or a status with its text.
 // Source: gRPC, doc/PROTOCOL-HTTP2.md.
 #include <fmt/format.h>
 
@@ -13,7 +13,7 @@
 namespace vla::door {
 namespace {
 
-constexpr std::size_t kMaxWords = 2000;  // of an error
+constexpr std::size_t kMaxWords = 2000;  // characters of an error's text
 constexpr auto kReceiptPatience = std::chrono::seconds(60);
 
 /// gRPC status codes.

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// What calls bring: headers, gRPC messages, and their order.
+// Receives calls, their headers and gRPC messages, and hands complete calls to the handler in turn.
 // Source: gRPC, doc/PROTOCOL-HTTP2.md.
 #include <fmt/format.h>
 

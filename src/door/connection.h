@@ -38,7 +38,7 @@ struct Call {
 /// What all connections have in common.
 struct Shared : net::Connections<Connection> {
   Rpcs::Handler* handler = nullptr;
-  std::vector<std::uint8_t> in = std::vector<std::uint8_t>(256 << 10);  // of the connection that is being read
+  std::vector<std::uint8_t> in = std::vector<std::uint8_t>(256 << 10);  // receive buffer of the connection being read
   std::map<std::uint64_t, Call*> calls = {};                            // not answered yet
   std::uint64_t n_id = 0;
   std::size_t n_call = 0;
@@ -74,10 +74,10 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
   void answer(Call& call, const std::string& message);
   void refuse(Call& call, const Error& error);
-  /// A call's message is being handled and no longer held.
+  /// Releases a call's message from `n_held`: the handler takes it.
   void received(Call& call);
 
-  // What the library calls. None may throw through it.
+  // Callbacks for the library. No exception may pass through it.
   template <class Step>
   static int called(void* connection, Step step) {
     auto& self = *static_cast<Connection*>(connection);
@@ -106,7 +106,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     } catch (const std::exception& exception) {
       try {
         drop("memory", exception.what());
-      } catch (const std::exception&) {  // closed before the handler was told of it
+      } catch (const std::exception&) {  // the connection is closed; the handler may not know
       }
     }
   }
@@ -123,7 +123,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
   static ssize_t read_answer(nghttp2_session* session, std::int32_t stream, std::uint8_t* to, std::size_t size,
                              std::uint32_t* flags, nghttp2_data_source* source, void*);
-  /// Removes a call from those that wait for an answer.
+  /// Removes a call from those that wait for an answer. Returns false if it is answered already.
   bool take(Call& call);
   void end(Call& call);
   void refuse_late();

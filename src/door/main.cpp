@@ -27,7 +27,7 @@ using serve::lerobot::Robots;
 using Kind = LinkMessage::Kind;
 
 constexpr int kLink = 3, kListener = 4, kFirstOther = 5;
-constexpr std::size_t kReceiptMessages = 4;  // the same as serve/options.h has for the other front ends
+constexpr std::size_t kReceiptMessages = 4;  // same value as for the other front ends, serve/options.h
 constexpr std::size_t kOwnMemory = 128u << 20;
 constexpr std::size_t kMaxKept = 1 << 20;  // largest message from the server: a response or a description
 constexpr auto kLastWords = std::chrono::milliseconds(500);

@@ -59,7 +59,7 @@ class Rpcs::All : public Shared {
     nghttp2_session_callbacks_set_on_data_chunk_recv_callback(callbacks_, on_data);
     nghttp2_session_callbacks_set_on_frame_send_callback(callbacks_, on_sent);
     nghttp2_session_callbacks_set_on_stream_close_callback(callbacks_, on_closed);
-    nghttp2_option_set_no_closed_streams(option_, 1);  // it would remember some for priorities
+    nghttp2_option_set_no_closed_streams(option_, 1);  // nghttp2 would keep some for priorities
   }
   ~All() {
     nghttp2_option_del(option_);

@@ -14,7 +14,7 @@ namespace vla::door {
 class Rpcs final : public serve::lerobot::Calls {
  public:
   using Handler = serve::lerobot::CallHandler;
-  static constexpr std::size_t kMaxPiece = (2 << 20) + 1024;  // per call; LeRobot's client splits messages at 2 MiB
+  static constexpr std::size_t kMaxPiece = (2 << 20) + 1024;  // bytes of a message; LeRobot's client splits at 2 MiB
   static constexpr std::size_t kMaxCalls = 16;                // per connection at once
 
   /// Takes ownership of the descriptor. `limits.connections` also limits the calls that run at once.
@@ -28,7 +28,7 @@ class Rpcs final : public serve::lerobot::Calls {
   /// Stops accepting connections and calls.
   void stop();
   bool has_answers() const;
-  /// Closes every connection. Call it while the handler lives, which is told of each.
+  /// Closes every connection and tells the handler of each; the handler must still exist.
   void end();
 
  private:

@@ -13,9 +13,9 @@ namespace vla {
 struct Description {
   struct View {
     std::string name, alias;          // the alias is empty if there is none
-    bool optional;                    // an observation without it declares it absent
+    bool optional;                    // whether an observation may omit the view, which declares it absent
     int width, height;                // pixels that the network sees; frames of any size are fitted
-    int camera_width, camera_height;  // of the frames that the checkpoint states; 0 if it states none
+    int camera_width, camera_height;  // the checkpoint's frame size in pixels; 0 if unstated
   };
   struct Number {
     std::string name, unit;  // the unit is empty if the bundle does not state it
@@ -33,13 +33,13 @@ struct Description {
   int horizon;  // rows of a chunk
   std::vector<Number> actions;
   double rate_hz;      // rows per second, 0 if the bundle does not state it
-  int n_action_steps;  // rows that the checkpoint executes before it looks again; 0 if unstated
+  int n_action_steps;  // rows to execute before the next observation, from the checkpoint; 0 if unstated
   int noise_rows,
-      d_action_padded;        // rows and columns of the noise: the solver's start, then that of each step that draws
-  std::string solver, noise;  // kinds
+      d_action_padded;        // rows and columns of the noise: the solver's start, then one part per noisy step
+  std::string solver, noise;  // kinds of the solver and of the noise
   int n_step;
   double t_start;
-  /// The checkpoint's settings of real-time chunking; a horizon of 0 if it states none.
+  /// The checkpoint's settings of real-time chunking. The horizon is 0 if it states none.
   struct Rtc {
     int execution_horizon;  // rows of a chunk that are executed
     std::string schedule;
@@ -53,7 +53,7 @@ struct Description {
   MemoryUse memory;
 };
 
-/// `robot` belongs to the engine.
+/// `robot` is one of the engine's robots.
 Description describe(const Engine& engine, const Robot& robot);
 
 }  // namespace vla

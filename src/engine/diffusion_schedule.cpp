@@ -50,7 +50,8 @@ float beta(const Betas& of, int i, int n) {
   return static_cast<float>(std::min(1 - alpha_bar(i + 1) / alpha_bar(i), 0.999));
 }
 
-/// Products of 1 - beta up to each training step. torch adds up factors in double and rounds each product.
+/// Products of 1 - beta up to each training step. torch accumulates the product in double and rounds each result to
+/// float32.
 std::vector<float> cumulative_alphas(const Betas& betas, int n) {
   std::vector<float> alphas;
   double product = 1;
@@ -61,7 +62,7 @@ std::vector<float> cumulative_alphas(const Betas& betas, int n) {
   return alphas;
 }
 
-/// `alpha`, `next`: cumulative alphas at the step's time and at that of the next step, 1 after the last.
+/// `alpha`, `next`: cumulative alphas at the times of this step and of the next one; 1 after the last step.
 DiffusionSchedule::Step step_between(int time, float alpha, float next, const DiffusionSchedule& of) {
   DiffusionSchedule::Step step = {time, 0, 0, 0, 0, 0};
   const float beta = 1.0f - alpha, next_beta = 1.0f - next;

@@ -16,15 +16,15 @@
 namespace vla {
 namespace {
 
-/// What one process has more than another that does the same: pages of its files that the system brings along, and a
-/// page of 2 MB where the allocator's memory happens to fill one. Measured: 2.1 MB.
+/// Margin for the memory by which two processes with the same work differ: file pages that the system reads ahead, and
+/// a huge page of 2 MB if the heap happens to fill one. Measured: 2.1 MB.
 constexpr std::size_t kProcessesDiffer = std::size_t{3} << 20;
 
-/// Turns std::bad_alloc of containers into an error: the act fails, and the next one starts from scratch. The strings
-/// fit into the small-string buffers.
+/// The error for std::bad_alloc of containers: the act fails, and the next one starts from scratch. The strings fit
+/// into small-string buffers, so they allocate nothing.
 Error no_memory() { return {Code::out_of_memory, "act", "", "no memory left", "free memory"}; }
 
-/// Sets what the network reads.
+/// Sets the plan's inputs: observation, noise and steering.
 void set_inputs(Plan& plan, const EncodedObservation& observation) {
   const Inputs& in = observation.inputs;
   const std::optional<Steering>& steering = observation.steering;
@@ -40,10 +40,10 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   std::unique_ptr<Engine> engine(new Engine(options));
   VLA_CHECK(engine->take_injected(options.inject));
   VLA_CHECK(engine->open_robots(std::move(file), options));
-  malloc_trim(0);  // reading a large vocabulary takes hundreds of megabytes
+  malloc_trim(0);  // returns the hundreds of MB that reading a large vocabulary takes
   VLA_TRY(engine->device_, options.model.empty() ? open_device(options.n_thread, options.kernels, options.device)
                                                  : open_model(options.model, options.kernels, options.device));
-  if (!options.dry && !engine->device_->is_host()) {  // the CPU's own threads would wait for others
+  if (!options.dry && !engine->device_->is_host()) {  // on the CPU, more threads would delay the device's own
     VLA_TRY(engine->host_threads_, HostThreads::start(options.n_thread));
   }
   WeightPlan plan;
@@ -66,7 +66,7 @@ Status Engine::declare_absent(const std::string& view) {
   return is_known ? Status() : robots_.front()->declare_absent(view);
 }
 
-/// Opens each robot with the bundle that it would have alone.
+/// Opens each robot with the bundle reduced to that robot.
 Status Engine::open_robots(Bundle file, const EngineOptions& options) {
   std::vector<std::string> tags = {options.embodiment};
   if (options.all_robots && options.embodiment.empty() && !file.embodiments().empty()) tags = file.embodiments();
@@ -82,7 +82,7 @@ Status Engine::open_robots(Bundle file, const EngineOptions& options) {
   return {};
 }
 
-/// All that an act needs.
+/// Loads the parameters, computes the robots' constants and builds the plans.
 Status Engine::build(const WeightPlan& plan, bool dry) {
   VLA_CHECK(device_->load(params(), !dry, plan));
   const PlanContext context = {*device_, tap_pattern_, dry, nullptr, see_graph_, see_tap_};
@@ -90,7 +90,7 @@ Status Engine::build(const WeightPlan& plan, bool dry) {
   return make_plans(dry);
 }
 
-/// Lowers programs that never run, for their sizes and the order in which an act reads matrices.
+/// Lowers programs without running them, to learn their sizes and the order in which an act reads matrices.
 Result<WeightPlan> Engine::plan_weights(std::size_t budget) {
   VLA_CHECK(build({}, true));
   VLA_TRY(const Plan* largest, plans_->for_shape(robot().network(), robot().largest_shape()));
@@ -114,7 +114,7 @@ Status Engine::make_plans(bool dry) {
   plans_.emplace(PlanContext{*device_, tap_pattern_, dry, nullptr, see_graph_, see_tap_});
   for (const auto& robot : robots_)
     if (const auto plan = plans_->for_shape(robot->network(), robot->largest_shape()); !plan) return plan.error();
-  // Injected values must fit the shape of their observation, so the plan of their shape is built.
+  // Injected values fit one input shape only, so plans with them are built when an observation arrives.
   if (!injected_.empty()) plans_.emplace(PlanContext{*device_, tap_pattern_, dry, &injected_, {}, see_tap_});
   return {};
 }
@@ -139,7 +139,7 @@ Result<const Robot*> Engine::robot(const std::string& tag) const {
                tag.empty() ? "none" : tag, "name the robot that the observation is of"};
 }
 
-/// Replaces values by injected ones. The host's inputs and results have names too, like the network's.
+/// Divides injected values into those of the network and those of its inputs. Tokens and results cannot be injected.
 Status Engine::take_injected(const std::vector<Tap>& given) {
   for (const Tap& tap : given) {
     if (tap.path == "chunk" || tap.path == "actions" || tap.path == "tokens")
@@ -196,7 +196,7 @@ Result<std::string> Engine::program_text(Part part) {
 }
 
 Result<StagePredictions> Engine::predict() {
-  if (!dry_) return StagePredictions();  // running it overwrites the working memory
+  if (!dry_) return StagePredictions();  // predicting overwrites the working memory
   VLA_TRY(const Plan* plan, plans_->for_shape(robot().network(), robot().largest_shape()));
   return plan->predict(robot().solver().n_run());
 }
@@ -245,14 +245,15 @@ Status Engine::warm_up(const ActShape& act) noexcept try {
   set_inputs(*plan, zeros);
   std::vector<Tap> taps;
   const Solver& solver = of->solver();
-  VLA_CHECK(solve(*plan, solver.decodes ? 1 : solver.n_step, {}, taps));  // of tokens, each costs the same
-  static_cast<void>(plan->x());                                           // waits
+  VLA_CHECK(solve(*plan, solver.decodes ? 1 : solver.n_step, {}, taps));  // one token is enough: all cost the same
+  static_cast<void>(plan->x());                                           // waits for the device
   return device_->failure();
 } catch (const std::bad_alloc&) {
   return no_memory();
 }
 
-/// Prefix and at most `most` steps of what was set. Errors: late, once `is_late` says so before a step.
+/// Runs the prefix and at most `most` steps on the inputs that were set. Errors: late, if `is_late` returns true before
+/// a step.
 Status Engine::solve(Plan& plan, int most, const std::function<bool()>& is_late, std::vector<Tap>& taps) {
   VLA_CHECK(plan.run_prefix(taps));
   for (int k = 0; k < most; ++k) {
@@ -288,7 +289,7 @@ Result<ActionChunk> Engine::run(EncodedObservation& encoded) {
   if (!in.state.empty()) record(taps, "state", {static_cast<std::int64_t>(in.state.size())}, in.state);
   clock.lap(timing, "plan");
   VLA_CHECK(solve(*plan, robot.solver().n_step, robot.solver().decodes ? encoded.is_late : nullptr, taps));
-  const std::vector<float> x = plan->x();  // other devices than the CPU are waited for here
+  const std::vector<float> x = plan->x();  // on devices other than the CPU, this waits for the result
   VLA_CHECK(device_->failure());
   if (robot.solver().decodes) record(taps, "tokens_out", {static_cast<std::int64_t>(x.size())}, x);
   encoded.pixels_ahead.reset();

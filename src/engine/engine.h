@@ -18,8 +18,8 @@ namespace vla {
 
 struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
-  std::string kernels;      // as open_device takes them; empty: the machine's best for the bundle's dtype
-  std::string model;        // name of a device's model, as open_model takes it; only with `dry`
+  std::string kernels;      // kernel names for open_device; empty: the machine's best for the bundle's dtype
+  std::string model;        // name of a device model for open_model; only with `dry`
   std::string device;       // cpu, vulkan:N or cuda:N; empty: the CPU
   std::string tap_pattern;  // empty: nothing is recorded
   /// Values that replace the computed ones at taps: those of the network, or `pixels` and `state`.
@@ -28,15 +28,15 @@ struct EngineOptions {
   std::vector<std::string> absent = {};  // views that no observation will have
   std::string embodiment = {};           // the robot's tag; empty if the bundle is for one robot
   bool all_robots = false;               // loads every robot of the bundle; then `embodiment` is empty
-  /// Called with the graphs of what is computed at load and of every plan, before they are lowered.
+  /// Called with every graph before it is lowered: the graphs that run at load, and those of every plan.
   std::function<void(const Graph&)> see_graph = {};
-  /// Receives values at taps, most of them as soon as they are computed, and on the CPU those of what is computed at
-  /// load. ActionChunk::taps, which would keep all of them, stays empty.
+  /// Receives the values of taps, most of them as soon as they are computed; on the CPU also the taps of the graphs
+  /// that run at load. ActionChunk::taps stays empty.
   TapVisitor see_tap = {};
   std::size_t memory = 0;  // budget in bytes for the process, or for the policy on a GPU; 0: no limit
 };
 
-/// Memory by use, in bytes: parameters and tables; inputs and cache of plans; what running graphs share.
+/// Memory by use, in bytes: parameters and tables; inputs and cache of plans; working memory that running graphs share.
 struct MemoryUse {
   std::size_t weights = 0, plan = 0, working = 0;
   std::size_t total() const { return weights + plan + working; }
@@ -46,7 +46,7 @@ struct MemoryUse {
 struct MemoryBudget {
   std::size_t size = 0;
   std::size_t process = 0;   // the process without the engine's memory; 0 on a GPU
-  std::size_t smallest = 0;  // the least budget that works in every process, which differ in size
+  std::size_t smallest = 0;  // the least budget that works, with a margin because processes differ in size
   std::size_t n_read = 0;    // read from the file in every act; 0: all matrices stay in memory
 };
 
@@ -56,7 +56,7 @@ struct MemoryBudget {
 class Engine {
  public:
   /// Opens, checks and loads a bundle, and builds the largest plans. Errors: io, bad_bundle, unsupported, device,
-  /// out_of_memory (also if the budget is too small; the error tells the least that works).
+  /// out_of_memory (also if the budget is too small; the error states the least budget that works).
   static Result<std::unique_ptr<Engine>> load(const std::string& path, const EngineOptions& options);
 
   /// In the bundle's order; at least one.
@@ -71,32 +71,35 @@ class Engine {
   /// unsupported, device, out_of_memory.
   Result<ActionChunk> act(const Observation& observation, const Noise& noise,
                           const std::optional<Leftover>& leftover = {}) noexcept;
-  /// The halves of an act. The host's: any thread may encode while another one computes. Errors: bad_observation,
-  /// unsupported, out_of_memory.
+  /// The host's half of an act; `compute` is the other half. Any thread may encode while another one computes. Errors:
+  /// bad_observation, unsupported, out_of_memory.
   Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                 EncodedObservation& to) const noexcept;
-  /// The device's, with unnormalization. Errors: those of `act`; late (EncodedObservation::is_late).
+  /// The device's half of an act, followed by unnormalization. Errors: those of `act`; late
+  /// (EncodedObservation::is_late).
   Result<ActionChunk> compute(EncodedObservation& encoded) noexcept;
-  /// Between them: the images go to the device while it computes another act. Errors: out_of_memory.
+  /// Optional, between `encode` and `compute`: sends the images to the device while it computes another act. Errors:
+  /// out_of_memory.
   Status send_ahead(EncodedObservation& encoded) const noexcept;
 
-  /// Of the last act: whose, and of which size. None before the first.
+  /// The robot and the input size of the last act. None before the first act.
   std::optional<ActShape> last_shape() const;
-  /// Computes an act of zeros, so that the first one of this size finds its plan, and on a GPU its graph. Errors:
-  /// bad_observation (no observation of this bundle has that size), device, out_of_memory, internal.
+  /// Computes an act with zeros as inputs, so that the plan of this size, and on a GPU its graph, are built before the
+  /// first request. Errors: bad_observation (no observation of this bundle has that size), device, out_of_memory,
+  /// internal.
   Status warm_up(const ActShape& act) noexcept;
-  /// Computes an act again with all taps: the path of the first value of the network that is not finite, or nothing
-  /// where all are. Slow, since its plans are built for it; no other thread may prepare meanwhile. Errors: those of
-  /// `act` but bad_action.
+  /// Computes an act again with all taps and returns the path of the network's first value that is not finite; empty if
+  /// all are finite. Slow, because it builds plans for this call. No other thread may encode meanwhile. Errors: those
+  /// of `act` except bad_action.
   Result<std::string> find_not_finite(const Observation& observation, const Noise& noise);
-  /// Solves for the first robot in another number of steps than the bundle asks for, to measure what a step costs; no
-  /// other thread may prepare meanwhile. Errors: bad_bundle, out_of_memory, device.
+  /// Replaces the bundle's number of solver steps for the first robot, to measure the cost of a step. No other thread
+  /// may encode meanwhile. Errors: bad_bundle, out_of_memory, device.
   Status set_steps(int n_step);
-  /// Prints the prefix's or a step's program for the first robot's largest observation, one line per operation: phase,
-  /// kernel, MFLOP, MB, what it computes, and the layouts of operands and results. Errors: out_of_memory.
+  /// The text of the prefix's or a step's program for the first robot's largest observation, one line per operation:
+  /// phase, kernel, MFLOP, MB, the operation, and the layouts of operands and results. Errors: out_of_memory.
   enum class Part { prefix, step };
   Result<std::string> program_text(Part part);
-  /// The network's work for the last observation. Empty before the first, and if its plan was evicted.
+  /// The network's work for the last observation. Empty before the first observation, or if its plan is evicted.
   StageWork work() const;
 
   /// Predicts the time of the first robot's largest observation for a dry engine: by a model of the device, or on the
@@ -110,7 +113,7 @@ class Engine {
   MemoryUse memory() const;
   /// All zeros without a budget.
   const MemoryBudget& budget() const { return budget_; }
-  /// Which kernel multiplies how many matrices, and their encoding: `avx2 (98 bf16)`.
+  /// The kernels of the matrix products, with the number of matrices per encoding: `avx2 (98 bf16)`.
   const std::string& linear_kernels() const { return device_->linear_kernels(); }
   /// The kernels in use, as `--kernels` names them: the machine's best, or others if the bundle's dtype asks for
   /// float32.
@@ -119,7 +122,7 @@ class Engine {
   /// "bf16" if activations are rounded to bf16 (sums are float32), else "f32".
   Precision precision() const;
   bool has_int8_products() const { return precision() == Precision::int8; }
-  /// The same as a text for display.
+  /// The precision as a text for display.
   std::string arithmetic() const;
   /// Whether some weights are ternary.
   bool has_ternary() const;
@@ -147,16 +150,16 @@ class Engine {
   std::string tap_pattern_;
   std::function<void(const Graph&)> see_graph_;
   TapVisitor see_tap_;
-  bool dry_, chose_kernels_;         // the user chose the kernels
-  std::vector<Tap> injected_;        // of the network
-  std::vector<Tap> injected_input_;  // of what it reads
-  std::unique_ptr<Device> device_;   // goes after what it made
-  HostThreads host_threads_;         // none on the CPU
+  bool dry_, chose_kernels_;         // chose_kernels_: the user named the kernels
+  std::vector<Tap> injected_;        // values to inject into the network
+  std::vector<Tap> injected_input_;  // values to inject into the inputs: pixels, state
+  std::unique_ptr<Device> device_;   // outlives the members below, which use it
+  HostThreads host_threads_;         // empty if the device is the CPU
   std::vector<std::unique_ptr<Robot>> robots_;
   std::optional<Plans> plans_;
   std::optional<std::pair<const Robot*, InputShape>> last_;
   MemoryBudget budget_;
-  EncodedObservation encoded_;  // of the last observation that came to `act` as a whole
+  EncodedObservation encoded_;  // buffer of `act`, reused by every call
 };
 
 }  // namespace vla

@@ -9,18 +9,18 @@
 
 namespace vla {
 
-/// Injected values: they replace what a plan's two graphs compute at their taps. Operations that only led to a replaced
+/// Values that replace those that a plan's two graphs compute at taps. Operations that are needed only for a replaced
 /// value are not run.
 class Injection {
  public:
   /// `given` may be null. `given` and `slots` must outlive this.
   Injection(const std::vector<Tap>* given, Slots& slots) : given_(given), slots_(slots) {}
 
-  /// The injectors of a plan's graphs, while they are recorded. A step's values are given for every step.
+  /// The injectors for recording a plan's two graphs. A value of the step's graph must be given for all `n_step` steps.
   Injector of_prefix();
   Injector of_step(int n_step);
-  /// Call it after both graphs are recorded. Errors: bad_observation, naming a value without a place or with a wrong
-  /// shape.
+  /// Call it after both graphs are recorded. Errors: bad_observation if a given value has a name that is in no graph,
+  /// or a wrong shape.
   Status check() const;
   /// Writes the values of the prefix or of step k. The slots must have memory.
   void set(Device& device, int k) const;
@@ -38,7 +38,7 @@ class Injection {
   Slots& slots_;
   std::vector<Place> places_;
   std::vector<const Slot*> filled_;
-  std::set<std::string> known_, used_;  // names in the graphs; names of given values
+  std::set<std::string> known_, used_;  // names in the graphs; names of given values found there
   Status problem_;
 };
 

@@ -60,7 +60,7 @@ std::vector<float> row_weights(const std::string& schedule, int delay, int n_row
   return weights;
 }
 
-/// The guidance's weight at `time`, which falls from 1 (noise) to 0 (actions); in float32 as in the reference.
+/// The weight of the guidance at `time`. Time falls from 1 (noise) to 0 (actions). In float32, as in the reference.
 float guidance_at(double time, float most) {
   const auto tau = static_cast<float>(1 - time);
   const float left = (1 - tau) * (1 - tau), c = tau == 0 ? most : (1 - tau) / tau;

@@ -25,8 +25,8 @@ struct Leftover {
 /// "guided", "inpainted", or empty for none.
 const char* kind_name(RealTimeChunking::Kind kind);
 
-/// How a Leftover changes a solve: a start, and for every step k and row r the velocity v' = keep * v + pull * (x -
-/// target).
+/// How a Leftover changes a solve: it replaces the start, and at every step k, in every row r, the velocity v by keep *
+/// v + pull * (x - target).
 struct Steering {
   std::vector<float> start;       // (horizon, d_action)
   std::vector<float> target;      // the leftover, padded with zeros: (horizon, d_action)
@@ -35,15 +35,16 @@ struct Steering {
 
 /// The sizes of a solve and of a chunk's rows.
 struct ChunkShape {
-  int horizon, d_action;    // columns that the network computes
-  int n_row, d_normalized;  // columns of ActionChunk::normalized
+  int horizon, d_action;    // rows and columns that the network computes
+  int n_row, d_normalized;  // rows and columns of ActionChunk::normalized
 };
 
-/// `start`: the solver's noise. A guided policy is pulled towards the rows in every step. An inpainted one starts from
-/// the rows, keeps the first `delay`, and changes later rows more the further they are from those. In the reference the
-/// velocity is computed before its gradient is enabled, so the correction is the weighted error itself. Source: lerobot
-/// policies/rtc/modeling_rtc.py RTCProcessor.denoise_step, get_prefix_weights; policies/groot/groot_n1_7.py
-/// get_action_with_features. Errors: unsupported (the policy cannot), bad_observation.
+/// Computes the steering from the solver's noise `start`. For a guided policy, every step pulls the chunk towards the
+/// rows. An inpainted policy starts from the rows, freezes the first `delay`, and lets later rows change more the
+/// further they are from the frozen ones. In the reference the velocity is computed before its gradient is enabled, so
+/// the correction is the weighted error itself. Source: lerobot policies/rtc/modeling_rtc.py RTCProcessor.denoise_step,
+/// get_prefix_weights; policies/groot/groot_n1_7.py get_action_with_features. Errors: unsupported (the policy cannot),
+/// bad_observation.
 Result<Steering> steer(const RealTimeChunking& rtc, const Solver& solver, const Leftover& leftover,
                        const ChunkShape& shape, std::vector<float> start);
 

@@ -21,7 +21,7 @@ TapFilter prefix_filter(const std::string& pattern) {
   return [pattern](const std::string& path) { return match_path(pattern, path); };
 }
 
-/// All steps share one graph, so it keeps every tap that any step wants; `collect_step_taps` selects.
+/// All steps share one graph, so it keeps every tap that the pattern selects in any step; `collect_step_taps` selects.
 TapFilter step_filter(const std::string& pattern, int n_step) {
   if (pattern.empty()) return {};
   return [pattern, n_step](const std::string& path) {
@@ -80,7 +80,7 @@ Status Plan::lower(const Network& network, const PlanContext& context) {
     record_decoder(step, network, changing);
   else
     record_solver(step, network, changing);
-  // The device counts, so nothing is uploaded between steps.
+  // The step advances k on the device, so nothing is uploaded between steps.
   if (network.conditions != nullptr || target_ != nullptr || solver_.counts())
     step.write(solver_.after(step, step.input(k_)), k_);
 
@@ -110,7 +110,8 @@ void Plan::record_solver(Graph& step, const Network& network, LowerOptions& chan
   step.write(step.name("x", solver_.next(step, x, answer, noise, k)), x_);
 }
 
-/// Prefix and step leave their logits in the same slot, and the step's own keys and values stay where it finds them.
+/// Prefix and step write their logits to the same slot. The step appends its keys and values to slots that its next
+/// runs read.
 void Plan::record_decoder(Graph& step, const Network& network, LowerOptions& changing) {
   logits_ = cache_.slot("logits");
   read_logits_.resize(static_cast<std::size_t>(count(logits_->shape)));
@@ -161,7 +162,7 @@ Status Plan::run_prefix(std::vector<Tap>& taps) {
   VLA_CHECK(prefix_->run());
   for (std::size_t i = 0; i < prefix_->taps().size(); ++i)
     taps.push_back({prefix_->taps()[i].path, dims(prefix_->taps()[i].shape), prefix_->tap(i)});
-  VLA_CHECK(step_->prepare());  // in the prefix's working memory
+  VLA_CHECK(step_->prepare());  // after the taps are read: it reuses the prefix's working memory
   prefix_ended_ = std::chrono::steady_clock::now();
   return {};
 }
@@ -202,7 +203,7 @@ StagePredictions Plan::predict(int n_step) const {
   parts.emplace_back("prefix", prefix[prefix.size() - 2]);
   Program::Prediction steps;
   for (int k = 0; k < n_step; ++k) steps += step.front();
-  (device_.is_host() ? parts.back().second : steps) += step.back();  // once, before or after `prefix_ended`
+  (device_.is_host() ? parts.back().second : steps) += step.back();  // `prepare`; on the host before `prefix_ended`
   parts.emplace_back("steps", steps);
   return parts;
 }

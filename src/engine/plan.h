@@ -15,17 +15,17 @@
 
 namespace vla {
 
-/// Work by stage, under the names that Timing has.
+/// Work by stage, with the stage names of Timing.
 using StageWork = std::vector<std::pair<std::string, Work>>;
 
 using StagePredictions = std::vector<std::pair<std::string, Program::Prediction>>;
 
-/// The network of a robot, which its plans are built from.
+/// The parts of a robot from which its plans are built.
 struct Network {
   const Policy& policy;
   const Solver& solver;
-  const Slot* conditions;  // [d, n_step]: what depends on time only, one column per solver step; or null
-  const Cache& constants;  // what depends on weights only
+  const Slot* conditions;  // [d, n_step]: values that depend only on time, one column per solver step; or null
+  const Cache& constants;  // values that depend only on weights
   int d_action, horizon;
 };
 
@@ -34,7 +34,7 @@ struct PlanContext {
   Device& device;
   std::string tap_pattern;
   bool dry;                               // sizes only, nothing is computed
-  const std::vector<Tap>* injected = {};  // null: nothing
+  const std::vector<Tap>* injected = {};  // values to inject; null: none
   std::function<void(const Graph&)> see_graph = {};
   TapVisitor see_tap = {};
 };
@@ -47,22 +47,23 @@ class Plan {
   static Result<std::unique_ptr<Plan>> build(const Network& network, const InputShape& shape,
                                              const PlanContext& context);
 
-  /// `ahead`: pixels that were sent to the device before, or null.
+  /// `ahead`: pixels that Device::send has sent already, or null.
   void set_inputs(std::span<const float> pixels, const Device::Sent* ahead, std::span<const std::int32_t> tokens,
                   std::span<const float> state);
-  /// Sets the start of the first step, and what is drawn for steps behind it.
+  /// Sets the noise of the act: the start of the first step, then the noise of each step that adds some.
   void set_noise(std::span<const float> noise);
   /// The network's answer: x, or the tokens that were decoded.
   std::vector<float> x() const { return token_ != nullptr ? decoded_ : device_.get(*x_); }
   /// Sets the steering, for a shape with a leftover.
   void set_steering(const Steering& steering);
 
-  /// Runs the prefix, which fills the cache, appends its taps, and computes what the steps need of the cache only.
+  /// Runs the prefix, which fills the cache, and appends its taps. Then computes the part of the steps that depends
+  /// only on the cache.
   Status run_prefix(std::vector<Tap>& taps);
-  /// Whether the act needs step k, after step k - 1 or the prefix. Of a policy that decodes, this reads the next token.
-  /// Errors: bad_action for logits that are not finite.
+  /// Whether the act needs step k. Call it after step k - 1, or after the prefix for k = 0. If the policy decodes
+  /// tokens, it also takes the next token from the logits. Errors: bad_action for logits that are not finite.
   Result<bool> needs_step(int k);
-  /// Runs step k after step k - 1: x <- the solver's next x, or the logits after the last token.
+  /// Runs step k after step k - 1: computes the solver's next x, or the logits that follow the last token.
   Status run_step(int k);
 
   /// The stages that the policy's prefix names, with the last run's times. Read x first.
@@ -96,19 +97,19 @@ class Plan {
   Device& device_;
   Slots slots_;
   // The inputs of an act, side by side in the order in which the act sets them, so that one upload sends them all.
-  // Images, tokens and state may be null. `x` is null where tokens are decoded, `token` where none are. `noise` is null
-  // unless steps read it; the last three are null without a leftover.
+  // Images, tokens and state may be null. `x` is null if the policy decodes tokens, `token` if it does not. `noise` is
+  // null unless steps read it. The last three are null without a leftover.
   Slot *images_, *tokens_, *state_, *x_, *token_, *k_, *noise_, *target_, *keep_, *pull_;
   Slot* logits_ = nullptr;
   const Solver& solver_;
-  std::vector<float> decoded_;      // tokens of this act
-  std::vector<float> read_logits_;  // the host's copy
-  std::vector<float> no_token_;     // zeros, which an act fills the slots of appended keys and values with
+  std::vector<float> decoded_;      // tokens of this act so far
+  std::vector<float> read_logits_;  // the host's copy of the logits
+  std::vector<float> no_token_;     // zeros, to clear the slots of appended keys and values before an act
   std::uint64_t views_;
   TextLayout text_;
   Cache cache_;
   Injection injection_;
-  int i_step_ = 0;  // the program that runs or ran last
+  int i_step_ = 0;  // the step that runs or ran last
   std::unique_ptr<Program> prefix_, step_;
   Program::Time prefix_ended_;
 };
@@ -118,10 +119,10 @@ class Plans {
  public:
   explicit Plans(PlanContext context) : context_(std::move(context)) {}
 
-  /// Returns the plan of a shape, building it if needed; all others are evicted if memory is short. `network` must
-  /// outlive it. Errors: those of Plan::build.
+  /// Returns the plan of a shape, building it if needed; all others are evicted first if they exceed the limit.
+  /// `network` must outlive it. Errors: those of Plan::build.
   Result<Plan*> for_shape(const Network& network, const InputShape& shape);
-  /// Null where there is none.
+  /// Null if there is none.
   const Plan* find(const Network& network, const InputShape& shape) const;
   void clear() { plans_.clear(); }
   /// Bytes of all plans.

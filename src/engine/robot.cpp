@@ -12,7 +12,8 @@ namespace {
 
 constexpr int kMaxHorizon = 4096;
 
-/// The values that `see_tap` receives. Without it none, since no act returns taps of what was computed at load.
+/// Selects the taps that `see_tap` receives. Without `see_tap` it selects none, because no act returns taps of the
+/// graphs that run at load.
 TapFilter filter_of(const PlanContext& context) {
   if (!context.see_tap) return {};
   return [pattern = context.tap_pattern](const std::string& path) { return match_path(pattern, path); };
@@ -71,7 +72,7 @@ Status Robot::compute_constants(const PlanContext& context) {
   return graph.nodes().empty() ? Status() : run_once(graph, context);
 }
 
-/// Computes the table of everything that depends on time only.
+/// Computes the table of the values that depend only on time.
 Status Robot::make_conditions(const PlanContext& context) {
   tables_ = Slots();
   conditions_ = nullptr;
@@ -114,7 +115,7 @@ InputShape Robot::shape_of(const EncodedObservation& observation) const {
           .text = policy_->text_layout(in.tokens)};
 }
 
-/// The key for views in a shape: two shapes are equal if the policy builds the same graph.
+/// The part of a shape that identifies the views; 0 if the policy builds the same graph for all views.
 std::uint64_t Robot::view_key(std::uint64_t views) const { return policy_->depends_on_which_views() ? views : 0; }
 
 RealTimeChunking Robot::real_time_chunking() const {
@@ -193,7 +194,7 @@ Status Robot::check_leftover(const Observation& observation, const Leftover& lef
   return {};
 }
 
-/// The chunk, normalized, that the network's answer stands for.
+/// Converts the network's answer to a normalized chunk: decodes action tokens, or returns the answer itself.
 Result<std::vector<float>> Robot::normalized_chunk(const std::vector<float>& answer, std::string& note) const {
   if (!processor_.action_tokens()) return answer;
   const std::vector<std::int32_t> ids(answer.begin(), answer.end());

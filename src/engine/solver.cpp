@@ -85,8 +85,7 @@ Tensor Solver::after(Graph& g, Tensor k) const {
   return column(g, g.add(op::Reshape{}, {table}, {1, n_step, 1, 1}), k);
 }
 
-/// The noise of step k is the one after the start's and those of steps before; after the last step it counts for
-/// nothing.
+/// Step k adds column k + 1 of the noise; column 0 is the start. The last step has the factor 0 for noise.
 Tensor Solver::denoised(Graph& g, Tensor x, Tensor answer, Tensor act_noise, Tensor k) const {
   using Step = DiffusionSchedule::Step;
   const auto& steps = diffusion->steps;
@@ -106,7 +105,7 @@ Tensor Solver::denoised(Graph& g, Tensor x, Tensor answer, Tensor act_noise, Ten
   return add(g, next, multiply(g, drawn, factor(&Step::of_drawn)));
 }
 
-/// The time of the step after step k; 0 after the last.
+/// t * start + (1 - t) * answer, where t is the time of the step after step k, or 0 after the last step.
 Tensor Solver::blend(Graph& g, Tensor answer, Tensor start, Tensor k) const {
   std::vector<float> shares;
   for (int next = 1; next <= n_step; ++next) {

@@ -15,30 +15,30 @@ namespace vla {
 
 /// The solver as data: the times at which the action head is evaluated, and the update rule.
 ///   euler, euler_float32  x <- x + dt * velocity(x, t_k), with equal steps from t_start to t_end
-///   direct                one pass: x <- what the network gives, from a start of zeros
-///   ddpm, ddim            as the scheduler of this name (engine/diffusion_schedule.h); ddpm draws noise in every step
-///                         but the last
-///   greedy                no field to integrate: the network answers tokens one by one, each the likeliest after those
-///                         before it, up to `steps` of them or the stop token
-///   renoise               the network gives actions: x <- t * start + (1 - t) * actions, where t is the next step's
+///   direct                one pass: x <- the network's answer, from a start of zeros
+///   ddpm, ddim            the diffusers scheduler of this name (engine/diffusion_schedule.h); ddpm adds noise in every
+///                         step but the last
+///   greedy                decodes tokens one by one, each the most likely next token, until the stop token or `steps`
+///                         tokens
+///   renoise               the network predicts actions: x <- t * start + (1 - t) * actions, where t is the next step's
 ///                         time, from 1 to 0 (lerobot policies/xvla/modeling_xvla.py generate_actions)
 struct Solver {
   int n_step = 0;
   bool direct = false, renoises = false;
   bool decodes = false;          // `greedy`
-  std::int32_t stop_token = -1;  // of `greedy`
+  std::int32_t stop_token = -1;  // ends the answer of `greedy`
   double t_end = 0;
   float dt = 0;  // (t_end - t_start) / n_step, computed in double and rounded once, as in the reference
   /// t_k; t_end is never evaluated. `euler`: t_start + k * dt in double, rounded once, as in LeRobot. `euler_float32`:
   /// dt added k times in float32, as in openpi. They differ by 1e-7, which changes a sine with a period of 4e-3 by one
   /// part in 1e4.
   std::vector<SolverTime> times;
-  std::string noise;  // kind of the start, and of what is drawn for steps: normal, uniform or none
+  std::string noise;  // kind of the noise, at the start and in steps: normal, uniform or none
   std::optional<DiffusionSchedule> diffusion;
 
-  /// How many chunks of noise an act has: the start, then one for each step that draws.
+  /// Chunks of noise in an act: the start, then one for each step that adds noise.
   int n_noise() const { return diffusion && diffusion->draws ? n_step : 1; }
-  /// Whether steps differ by their number.
+  /// Whether a step depends on its index k.
   bool counts() const { return renoises || decodes || diffusion.has_value(); }
   /// Runs of the step's graph in an act, at most: the first token comes from the prefix.
   int n_run() const { return decodes ? n_step - 1 : n_step; }
@@ -49,8 +49,8 @@ struct Solver {
   /// models_pytorch/pi0_pytorch.py sample_actions.
   static Result<Solver> read(const Keys& keys);
 
-  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x. `act_noise` is the act's,
-  /// [d_action * horizon, n_noise], for a solver that reads it again, and `k` [1] i32 the step, for all but Euler's.
+  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x. `act_noise` [d_action *
+  /// horizon, n_noise], the act's noise, is needed if `rereads_noise()`; `k` [1] i32, the step's index, if `counts()`.
   Tensor next(Graph& g, Tensor x, Tensor answer, Tensor act_noise = {}, Tensor k = {}) const;
   /// The step after step k [1] i32, and 0 after the last.
   Tensor after(Graph& g, Tensor k) const;

@@ -65,7 +65,7 @@ Status write_taps(const std::vector<Tap>& taps, const std::string& file) {
   Keys keys;
   keys.set("general.architecture", Value(std::string("vla-taps")));
   std::vector<TensorInfo> tensors;
-  std::map<std::string, int> times;  // a module that runs once for each size of frames has its path more than once
+  std::map<std::string, int> times;  // a module that runs once per frame size records its path several times
   for (const Tap& tap : taps) {
     const int time = ++times[tap.path];
     tensors.push_back({time > 1 ? fmt::format("{}.{}", tap.path, time) : tap.path, DType::f32, tap.shape,

@@ -50,7 +50,8 @@ Result<std::unique_ptr<Device>> GgmlDevice::open(ggml_backend_dev_t of, const st
 }
 
 /// Leaks what a lost device holds until the process ends: freeing it would raise another driver error, which a
-/// destructor cannot report. The same for other devices after an abort, which may have left their locks held.
+/// destructor cannot report. After an abort in ggml, also leaks what other devices hold: the abort may have left their
+/// locks held.
 GgmlDevice::~GgmlDevice() {
   if (!backend()) return;
   const Status answers = guarded([&] { ggml_backend_synchronize(backend()); });
@@ -61,7 +62,7 @@ GgmlDevice::~GgmlDevice() {
 }
 
 /// The type of a parameter on the device. Matrices become float32 if the backend's products of bf16 and f16 would round
-/// activations, unless rounding was asked for. Table rows are widened exactly at lookup.
+/// activations, unless rounding is requested. Table rows are widened exactly at lookup.
 ggml_type GgmlDevice::resident_type(const Param& param) const {
   const ggml_type type = type_of(resident_encoding(param, rounding_).type);
   const bool kept = type == GGML_TYPE_F16 ? keeps_f16_ : type == GGML_TYPE_BF16 && rounding_ == Rounding::bf16;
@@ -71,7 +72,7 @@ ggml_type GgmlDevice::resident_type(const Param& param) const {
 Status GgmlDevice::load(const ParamList& params, bool fill, const WeightPlan& plan) {
   VLA_CHECK(check_rounding(params, rounding_));
   memory().set_dry(!fill);
-  held_->working.clear();  // of freed programs
+  held_->working.clear();  // memory of freed programs
   windows_.reset();
   VLA_CHECK(make_tensors(params, plan));
   if (weights_.empty()) return {};
@@ -190,12 +191,12 @@ Result<ggml_backend_buffer_ptr> GgmlDevice::allocate_host(std::size_t size) cons
   return buffer;
 }
 
-/// Null if memory is short.
+/// Returns staging memory of at least `size` bytes that keeps earlier uploads; null if memory is short.
 std::byte* GgmlDevice::staging(std::size_t size) {
   ggml_backend_buffer_ptr& staging = held_->staging;
   if (staging != nullptr && size <= ggml_backend_buffer_get_size(staging.get()))
     return static_cast<std::byte*>(ggml_backend_buffer_get_base(staging.get()));
-  constexpr std::size_t kRest = 65536;  // images are first, so what follows them fits too
+  constexpr std::size_t kRest = 65536;  // images come first, so the inputs after them fit too
   auto larger = allocate_host(size + kRest);
   if (!larger) return nullptr;
   void* to = ggml_backend_buffer_get_base(larger->get());
@@ -209,7 +210,7 @@ void GgmlDevice::set(const Slot& slot, const void* data, std::size_t size) {
   if (failure_) return;
   const auto* tensor = static_cast<const ggml_tensor*>(slot.place);
   std::size_t begin = 0;
-  bool follows = false;  // the last one, except for its alignment
+  bool follows = false;  // adjacent to the last upload, except for alignment padding
   if (!uploads_.empty()) {
     const Upload& last = uploads_.back();
     const auto distance = static_cast<std::size_t>(static_cast<const std::byte*>(tensor->data) -
@@ -226,7 +227,7 @@ void GgmlDevice::set(const Slot& slot, const void* data, std::size_t size) {
   uploads_.back().size = begin + size - uploads_.back().begin;
 }
 
-/// Uploads what was set.
+/// Uploads the bytes of all `set` calls.
 Status GgmlDevice::flush() const {
   const Status done = guarded([&] {
     for (const Upload& upload : uploads_) {
@@ -279,7 +280,7 @@ Result<std::shared_ptr<ggml_gallocr>> GgmlDevice::place(ggml_cgraph* graph) {
   std::shared_ptr<ggml_gallocr> places = make();
   std::size_t size = 0;
   ggml_gallocr_reserve_n_size(places.get(), graph, nullptr, nullptr, &size);
-  // Shared places must be in one buffer, so that none of them moves.
+  // Memory that programs share must be one buffer, so that no value moves.
   const bool fits = !held_->working.empty() && size <= held_->working.back().size &&
                     held_->working.back().size <= ggml_backend_buft_get_max_size(memory().type());
   if (!fits) {
@@ -301,7 +302,7 @@ Result<std::unique_ptr<Program>> GgmlDevice::lower(const Graph& graph, const Low
   return GgmlProgram::make(graph, *this);
 }
 
-/// On the host a budget is that of the process, which would have every window twice.
+/// No streaming on the host: its budget is that of the process, which would hold every window twice.
 Result<WeightPlan> GgmlDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
   if (is_host()) return Device::plan_weights(prefix, step, size);
   const auto &first = static_cast<const GgmlProgram&>(prefix), &then = static_cast<const GgmlProgram&>(step);

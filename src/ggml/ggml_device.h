@@ -22,8 +22,8 @@ class GgmlDevice final : public Device {
  public:
   /// Errors: device.
   static Result<std::unique_ptr<Device>> cpu(int n_thread);
-  /// A device other than the CPU, with Rounding::none or bf16; bf16 also rounds what bf16 matrices multiply.
-  /// `keeps_f16`: products of f16 weights are as exact as those of float32. Errors: device.
+  /// A device other than the CPU, with Rounding::none or bf16; bf16 also rounds the activations that bf16 matrices
+  /// multiply. `keeps_f16`: products of f16 weights are as exact as those of float32. Errors: device.
   static Result<std::unique_ptr<Device>> open(ggml_backend_dev_t of, const std::string& name, bool keeps_f16,
                                               Rounding rounding);
   ~GgmlDevice() override;
@@ -54,8 +54,8 @@ class GgmlDevice final : public Device {
   GgmlMemory& memory() const { return *held_->memory; }
   /// Allocates host memory for uploads, pinned by the driver if it can. Errors: device, out_of_memory.
   Result<ggml_backend_buffer_ptr> allocate_host(std::size_t size) const;
-  /// Places a graph's values in memory that all programs share, since one runs at a time. The result keeps that memory.
-  /// Errors: out_of_memory.
+  /// Places a graph's values in memory that all programs share, since one runs at a time. The result keeps the memory
+  /// alive. Errors: out_of_memory.
   Result<std::shared_ptr<ggml_gallocr>> place(ggml_cgraph* graph);
 
   /// Calls a function of the backend. After the first failure every call returns that error. Errors: device,
@@ -67,10 +67,10 @@ class GgmlDevice final : public Device {
     if (!done) failure_ = done.error();
     return done;
   }
-  /// Loads groups of streamed matrices for the next launches, until others are asked for. Errors: bad_bundle if the
-  /// file no longer has these bytes, device.
+  /// Loads groups of streamed matrices for the next launches, until other groups are requested. Errors: bad_bundle if
+  /// the file no longer has these bytes, device.
   Status bring(const lower::Groups& groups);
-  /// Runs a graph; it is complete at the latest when somebody waits. Errors: device, out_of_memory.
+  /// Starts a graph; it is complete after `wait`. Errors: device, out_of_memory.
   Status launch(ggml_cgraph* graph);
   Status wait();
 
@@ -105,7 +105,7 @@ class GgmlDevice final : public Device {
     std::vector<Working> working;  // the last one serves new programs, earlier ones belong to older programs
     ggml_backend_buffer_ptr staging;
     std::shared_ptr<void> windows;  // GgmlWindows::held
-    Held* next = nullptr;           // of programs that are not freed
+    Held* next = nullptr;           // list of leaked devices (see the destructor)
   };
   ggml_type resident_type(const Param& param) const;
 
@@ -119,7 +119,7 @@ class GgmlDevice final : public Device {
   std::shared_ptr<void> weight_memory_;
   std::size_t weights_size_ = 0;
   std::vector<ggml_tensor*> weights_;         // by Param::id
-  std::vector<int> groups_;                   // the same
+  std::vector<int> groups_;                   // by Param::id
   std::vector<ggml_tensor*> window_tensors_;  // none if all weights are resident
   std::shared_ptr<lower::DeviceWindows> windows_;
   std::string linear_text_;

@@ -22,7 +22,7 @@ Result<ggml_backend_reg_t> GgmlBackend::registry() const {
   return opened;
 }
 
-/// Includes driver and version, which a report of wrong values needs first.
+/// Descriptions include the driver and its version, which a report of wrong values needs first.
 Result<std::vector<DeviceInfo>> GgmlBackend::list() const {
   VLA_TRY(ggml_backend_reg_t found, registry());
   std::vector<DeviceInfo> devices;

@@ -12,8 +12,8 @@ namespace vla {
 struct GgmlBackend {
   const char* kind;                                  // "vulkan"
   ggml_backend_reg_t (*open)();                      // null if the driver is missing
-  std::string (*driver)(ggml_backend_dev_t device);  // its name and version
-  bool keeps_f16 = false;                            // its products of f16 weights are as exact as those of float32
+  std::string (*driver)(ggml_backend_dev_t device);  // the driver's name and version
+  bool keeps_f16 = false;                            // products of f16 weights are as exact as those of float32
 
   /// DeviceLibrary::list and DeviceLibrary::open for one backend per library.
   Result<std::vector<DeviceInfo>> list() const;
@@ -23,7 +23,7 @@ struct GgmlBackend {
   Result<ggml_backend_reg_t> registry() const;
 };
 
-/// The function that a backend's library exports.
+/// The DeviceLibrary that a backend's library exports.
 template <const GgmlBackend& backend>
 DeviceLibrary library_of() {
   return {kDeviceBuild, [] { return backend.list(); },

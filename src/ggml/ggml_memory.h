@@ -14,11 +14,11 @@ namespace vla {
 /// A context for `n` tensors without memory. Errors: out_of_memory.
 Result<ggml_context_ptr> make_context(std::size_t n, std::size_t extra = 0);
 
-/// Memory of one backend. Returned buffers are kept and reused: Mesa's lavapipe 22.3 was seen to corrupt its heap when
-/// buffers come and go, and plans come and go.
+/// Memory of one backend. Returned buffers are kept and reused, since plans come and go: Mesa's lavapipe 22.3 was seen
+/// to corrupt its heap when buffers are freed and allocated again.
 class GgmlMemory {
  public:
-  /// `device` is null for the CPU, whose memory is not counted beforehand.
+  /// `device` is null for the CPU, whose free memory is not checked before an allocation.
   GgmlMemory(std::string name, ggml_backend_buffer_type_t type, ggml_backend_dev_t device)
       : name_(std::move(name)), type_(type), device_(device), kept_(std::make_shared<Buffers>()) {}
 
@@ -29,16 +29,16 @@ class GgmlMemory {
   /// Bytes in returned buffers.
   std::size_t idle_size() const;
 
-  /// Places every tensor of the context until the last copy of `*holder` is gone. Returns bytes. Errors: out_of_memory;
-  /// unsupported if a tensor exceeds the largest buffer.
+  /// Allocates memory for every tensor of the context, until the last copy of `*holder` is gone. Returns its bytes.
+  /// Errors: out_of_memory; unsupported if a tensor exceeds the largest buffer.
   Result<std::size_t> place(ggml_context* tensors, const char* what, std::shared_ptr<void>* holder);
   /// Places a tensor inside another one's memory. Errors: device.
   Status place_inside(const ggml_tensor& larger, std::size_t offset, ggml_tensor* tensor) const;
   /// Bytes from one tensor's place to the next.
   std::size_t size_of(const ggml_tensor* tensor) const;
-  /// Errors: out_of_memory if the device has less than that left.
+  /// Errors: out_of_memory if less than `size` bytes of the device are free.
   Status check_free(std::size_t size, const char* what) const;
-  /// The error after the device refused memory that it reported as free.
+  /// The error if the device refuses memory that it reported as free.
   Error refused(std::size_t size, const char* what) const;
   ggml_backend_buffer_type_t type() const { return type_; }
 

@@ -32,7 +32,7 @@ ggml_type type_of(DType type) {
     case DType::i32:
       return GGML_TYPE_I32;
     case DType::i8:
-    case DType::ternary:  // its bytes
+    case DType::ternary:  // codes are bytes
     case DType::int4:
       return GGML_TYPE_I8;
     case DType::f64:  // f64 occurs in statistics only, which no graph reads

@@ -10,7 +10,7 @@ namespace vla {
 namespace {
 
 /// Translates each node to one or a few ggml operations. If ggml's own operation differs from float32 in the last
-/// digits, it is composed of exact ones.
+/// digits, the node is composed of exact operations.
 class Translator {
  public:
   Translator(ggml_context* context, ggml_context* constants, GgmlDevice& device)
@@ -158,7 +158,8 @@ class Translator {
     return ggml_repeat_4d(c, contiguous(in(0)), s[0], s[1], s[2], s[3]);
   }
   ggml_tensor* translate(const op::Reshape&) { return reshaped(in(0), node_->shape); }
-  /// ggml asks where each dimension of x goes, and not all of its operations read rows that are not contiguous.
+  /// ggml_permute takes the destination of each dimension of x. The result is made contiguous, because not all ggml
+  /// operations read rows that are not.
   ggml_tensor* translate(const op::Permute& op) {
     std::array<int, 4> to{};
     for (int i = 0; i < 4; ++i) to[static_cast<std::size_t>(op.order[static_cast<std::size_t>(i)])] = i;
@@ -172,7 +173,8 @@ class Translator {
   ggml_tensor* translate(const op::PixelShuffle& op) {
     ggml_tensor* x = in(0);
     const std::int64_t f = op.factor, n_row = x->ne[1] / op.n_column;
-    // Patch (f R + r, f C + c): the order after the features is c, C, r, R; exchanging C and r gives the squares.
+    // Patch (f R + r, f C + c): the order after the features is c, C, r, R; exchanging C and r makes each f x f square
+    // contiguous.
     ggml_tensor* split = reshaped(x, {x->ne[0] * f, op.n_column / f, f, n_row / f * x->ne[2]});
     return reshaped(ggml_cont(c, ggml_permute(c, split, 0, 2, 1, 3)), node_->shape);
   }
@@ -239,7 +241,7 @@ Work work_of(const Node& node) {
   return work;
 }
 
-/// Checks that the backend has the operations that a node became. Errors: unsupported, with the first that it lacks.
+/// Checks that the backend supports the ggml operations of a node. Errors: unsupported, naming the first that it lacks.
 Status check_supported(const GgmlDevice& device, ggml_cgraph* graph, int first, const Node& node) {
   for (int i = first; i < ggml_graph_n_nodes(graph); ++i) {
     const ggml_tensor* made = ggml_graph_node(graph, i);
@@ -255,7 +257,7 @@ Status check_supported(const GgmlDevice& device, ggml_cgraph* graph, int first, 
 }  // namespace
 
 Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevice& device) {
-  constexpr std::size_t kMaxPerNode = 16;  // tensors that one node becomes, but for concatenations
+  constexpr std::size_t kMaxPerNode = 16;  // most tensors of a node, without its concatenations
   std::unique_ptr<GgmlProgram> program(new GgmlProgram(device));
   std::size_t n = 64;
   for (const Node& node : graph.nodes()) n += kMaxPerNode + 2 * node.in.size();
@@ -268,8 +270,8 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
   Translator translate(c, program->constant_context_.get(), device);
   const std::vector<bool> needed = graph.needed();
   std::vector<std::pair<ggml_tensor*, const Node*>> constants;
-  std::vector<int> phase_end;          // nodes of ggml
-  std::vector<std::size_t> stage_end;  // phases
+  std::vector<int> phase_end;          // in ggml nodes
+  std::vector<std::size_t> stage_end;  // in phases
   program->work_.resize(n_stage);
   for (const Node& node : graph.nodes()) {
     while (stage_end.size() < graph.stages().size() &&
@@ -317,11 +319,11 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
   return std::unique_ptr<Program>(std::move(program));
 }
 
-/// Where a stage ends, and where groups of streamed matrices must come.
+/// Cuts the graph where a stage ends and where groups of streamed matrices must be loaded.
 Status GgmlProgram::cut(const std::vector<int>& phase_end, const std::vector<std::size_t>& stage_end) {
   VLA_TRY(const std::vector<lower::Groups> groups, lower::find_groups(reads_, device_.groups()));
   std::size_t begin = 0;
-  int first = 0;  // node of ggml
+  int first = 0;  // index of a ggml node
   for (const std::size_t end : stage_end) {
     std::vector<Part>& parts = parts_.emplace_back();
     for (const lower::Segment& segment : lower::cut_phases(std::span(groups).subspan(begin, end - begin), begin)) {
@@ -335,7 +337,7 @@ Status GgmlProgram::cut(const std::vector<int>& phase_end, const std::vector<std
     begin = end;
   }
   const bool is_whole = parts_.size() == 1 && parts_.front().size() == 1;
-  if (is_whole) parts_.front().front().graph = graph_;  // which knows what a backend may fuse
+  if (is_whole) parts_.front().front().graph = graph_;  // the full graph records what a backend may fuse
   return {};
 }
 

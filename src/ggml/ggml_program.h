@@ -6,10 +6,10 @@
 
 namespace vla {
 
-/// A graph as plain ggml operations, one after the other as they were recorded.
+/// A graph as plain ggml operations, in the order in which its nodes were recorded.
 class GgmlProgram final : public Program {
  public:
-  /// Errors: out_of_memory, device, unsupported where the backend lacks an operation.
+  /// Errors: out_of_memory, device, unsupported if the backend lacks an operation.
   static Result<std::unique_ptr<Program>> make(const Graph& graph, GgmlDevice& device);
 
   Status run() override;
@@ -35,9 +35,9 @@ class GgmlProgram final : public Program {
   GgmlDevice& device_;
   ggml_context_ptr context_, constant_context_;
   std::shared_ptr<void> constant_memory_;
-  std::shared_ptr<ggml_gallocr> places_;  // of all other values
+  std::shared_ptr<ggml_gallocr> places_;  // memory of all other values
   ggml_cgraph* graph_ = nullptr;
-  std::vector<std::vector<Part>> parts_;  // of the graph, stage by stage
+  std::vector<std::vector<Part>> parts_;  // parts of the graph, by stage
   lower::MatrixReads reads_;
   std::vector<Stage> stages_;
   std::vector<Work> work_;

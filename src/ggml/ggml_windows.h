@@ -8,8 +8,8 @@
 
 namespace vla {
 
-/// Windows that groups of matrices come to while the backend computes; without events, between two graphs. Those of the
-/// host are of the driver's own kind, where it has one.
+/// Windows into which groups of matrices are copied while the backend computes, or between two graphs if the backend
+/// has no events. The host's windows are in the driver's host memory, if it has any.
 class GgmlWindows final : public lower::WindowMemory {
  public:
   /// windows: tensors of one size. Errors: device, out_of_memory.
@@ -18,13 +18,13 @@ class GgmlWindows final : public lower::WindowMemory {
   std::byte* host(int window) override;
   Status note_read(int window) override;
   Status upload(int window, std::size_t size) override;
-  /// Everything that the driver is asked to free.
+  /// Everything that the driver must free.
   std::shared_ptr<void> held() const { return held_; }
 
  private:
   struct Held {
     ggml_backend_buffer_ptr host;
-    // They stand for all graphs that read a window until now; null of a backend without events.
+    // By window, the event after all graphs that have read it so far; null if the backend has no events.
     std::array<ggml_backend_event_ptr, lower::WeightStream::kWindows> read;
   };
   GgmlWindows(GgmlDevice& device, std::vector<ggml_tensor*> windows) : device_(device), windows_(std::move(windows)) {}

@@ -9,11 +9,11 @@
 namespace vla {
 namespace {
 
-constexpr std::size_t kMaxLog = 1024;  // bytes of what was logged that are kept
+constexpr std::size_t kMaxLog = 1024;  // bytes of the log that are kept, up to one message more
 
 std::atomic<bool> aborted = false;
 thread_local int n_guard = 0;
-thread_local std::string logged;  // by the innermost guard's calls
+thread_local std::string logged;  // errors of ggml since the outermost guard began
 
 void on_log(ggml_log_level level, const char* text, void*) {
   if (n_guard > 0 && level == GGML_LOG_LEVEL_ERROR && logged.size() < kMaxLog) logged += text;

@@ -12,15 +12,16 @@
 
 namespace vla {
 
-/// From now on an abort of ggml becomes an exception where `guarded` catches it. What ggml logged as an error before is
-/// part of its text, since that is where CUDA's reason stands.
+/// Turns aborts of ggml into exceptions that `guarded` catches. The text of an exception includes the errors that ggml
+/// logged before, because CUDA's reason is among them.
 void set_guard() noexcept;
 
-/// An abort was made an exception. It left ggml's functions where they stood, maybe with locks of all devices held.
+/// Whether an abort became an exception. It left ggml's functions without cleanup, perhaps with locks held that all
+/// devices share.
 bool ggml_aborted() noexcept;
 
-/// While one lives, ggml's abort on this thread is an exception. The frames that it leaves are C++, or C compiled with
-/// -fexceptions (cmake/deps.cmake); a destructor among them that fails as well ends the process.
+/// While a Guard lives, an abort of ggml on its thread throws an exception. The exception unwinds C++ frames, and C
+/// frames compiled with -fexceptions (cmake/deps.cmake). A destructor that throws meanwhile ends the process.
 class Guard {
  public:
   Guard() noexcept;
@@ -31,8 +32,8 @@ class Guard {
 
 Error lost_device(const std::string& device, const std::string& what);
 
-/// Calls functions of a backend, which throws or aborts where its driver answers with an error. Not for what ggml's own
-/// threads compute: they would wait forever for the one that left. Errors: device, out_of_memory.
+/// Calls functions of a backend, which throw or abort if its driver returns an error. Not for work on ggml's own
+/// threads: the other threads would wait forever for the one that threw. Errors: device, out_of_memory.
 template <class F>
 Status guarded(const std::string& device, const F& call) {
   const Guard guard;

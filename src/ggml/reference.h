@@ -6,7 +6,7 @@
 
 namespace vla {
 
-/// The CPU with ggml's plain operations, for who may not know ggml: GgmlDevice::cpu. Errors: device.
+/// Opens the CPU with ggml's plain operations (GgmlDevice::cpu), for callers that do not include ggml. Errors: device.
 Result<std::unique_ptr<Device>> open_reference(int n_thread);
 
 }  // namespace vla

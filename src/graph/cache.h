@@ -10,23 +10,24 @@
 
 namespace vla {
 
-/// Where a graph that runs step by step keeps the next token's values: column k of `capacity` in run k.
+/// Selects the column of `capacity` that receives the next token's values: in run k of the graph, column k.
 struct AppendPlace {
   Tensor here, elsewhere;  // [1, 1, capacity]: 1 at k and 0 elsewhere, and the reverse
 };
 
-/// Values that one graph leaves for later graphs, by path: the prefix for the solver steps, load time for both.
+/// Values, by path, that one graph stores for later graphs: the load-time graph for prefix and steps, the prefix for
+/// the steps.
 class Cache {
  public:
-  /// Keeps `value` under its path, which is also a tap. Call it while the graph that computes the value is recorded.
+  /// Stores `value` under `path`, which is also a tap. Call it while the graph that computes the value is recorded.
   void put(Graph& g, const std::string& path, Tensor value) {
     Slot* slot = g.slots().add_f32(value.shape());
     value = g.name(path, value);
     g.write(value, slot);
     entries_[path] = {slot, g.serial(), value};
   }
-  /// Keeps `value` [d, n, 1] as the next token's. Returns those of all tokens so far, [d, n, capacity]; what follows
-  /// them is finite. The slot outlives the run, and whoever runs the graph fills it with zeros before the first one.
+  /// Stores `value` [d, n, 1] for the next token. Returns the values of all tokens so far, [d, n, capacity]; the
+  /// remaining columns are finite. The slot outlives the run; the caller fills it with zeros before the first run.
   Tensor append(Graph& g, const std::string& path, Tensor value, const AppendPlace& place) {
     const Shape shape = {value.dim(0), value.dim(1), place.here.dim(2), 1};
     Slot* slot = g.slots().add_f32(shape);
@@ -39,12 +40,12 @@ class Cache {
   }
   const std::vector<Slot*>& appended() const { return appended_; }
   bool has(const std::string& path) const { return entries_.count(path) != 0; }
-  /// The value that `put` kept; in the graph that computes it, the value itself.
+  /// Returns the stored value as an input; in the graph that computes it, the computed tensor.
   Tensor get(Graph& g, const std::string& path) const {
     const Entry& entry = entries_.at(path);
     return entry.graph == g.serial() ? entry.value : g.input(entry.slot);
   }
-  /// Where `put` kept the value.
+  /// The slot in which `put` stored the value.
   Slot* slot(const std::string& path) const { return entries_.at(path).slot; }
 
  private:

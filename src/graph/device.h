@@ -18,7 +18,7 @@
 
 namespace vla {
 
-/// The type that operands of large products are rounded to; sums are float32, or integers of int8.
+/// The type that operands of large products are rounded to; sums are float32, but integers for int8 products.
 enum class Precision { f32, bf16, int8 };
 
 constexpr const char* precision_name(Precision precision) {
@@ -39,27 +39,27 @@ class Program {
   using Time = std::chrono::steady_clock::time_point;
   virtual ~Program() = default;
 
-  /// Computes what depends only on inputs that stay the same from run to run (LowerOptions::varying). Errors: device;
-  /// bad_bundle if table rows are read from a file that has changed since it was opened.
+  /// Computes the values that depend only on inputs that do not change from run to run (LowerOptions::varying). Errors:
+  /// device; bad_bundle if table rows are read from a file that has changed since it was opened.
   virtual Status prepare() { return {}; }
   /// Errors: those of `prepare`.
   virtual Status run() = 0;
 
   struct Stage {
     std::string name;
-    Time done;  // of the last run
+    Time done;  // when the stage ended in the last run
   };
   virtual const std::vector<Stage>& stages() const = 0;
-  /// The time at which the last run ended, for a device that still computes when `run` returns. Stage times are known
-  /// once a result was read.
+  /// The time at which the last run ended, for a device that still computes when `run` returns. Stage times are valid
+  /// after a result is read.
   virtual std::optional<Time> ended() const { return {}; }
   /// The work of a run: one entry per stage, then one for everything after the last stage.
   virtual std::vector<Work> work() const = 0;
   /// The predicted time of a run: by a model of a device that is not present, or from timed parts of the program.
   struct Prediction {
     double seconds = 0;
-    // The share of it that remains if nothing overlapped: products at their units' rate, bytes at the memory's, and
-    // launches.
+    // Seconds that each kind of work takes alone: products at their units' rate, bytes at the memory's rate, and
+    // launches. Where they overlap, `seconds` is less than their sum.
     double products = 0, bytes = 0, launches = 0;
     int n_launch = 0;
 
@@ -69,7 +69,8 @@ class Program {
       return *this;
     }
   };
-  /// One entry per stage, one for everything after the last stage, and one for `prepare`. Empty for other devices.
+  /// One entry per stage, one for everything after the last stage, and one for `prepare`. Empty if the device predicts
+  /// nothing.
   virtual std::vector<Prediction> predictions() const { return {}; }
 
   struct Tap {
@@ -92,18 +93,18 @@ using TapVisitor =
 
 /// Options for lowering a graph.
 struct LowerOptions {
-  /// Slots that change from run to run. If given, Program::prepare computes what depends on none of them.
+  /// Slots that change from run to run. If given, Program::prepare computes the values that depend on none of them.
   std::vector<const Slot*> varying;
   /// Receives each tap's values during `run`, as soon as they are computed, so that none is kept. Only our own kernels
   /// for CPUs call it; other programs ignore it and fill Program::taps.
   TapVisitor see_tap = {};
 };
 
-/// A device that is there.
+/// An available device.
 struct DeviceInfo {
   std::string name, description;
-  std::size_t memory = 0, free = 0;  // bytes; 0 free if the device must be opened to tell
-  std::string precision;             // of products: "f32, bf16"
+  std::size_t memory = 0, free = 0;  // bytes; `free` is 0 if only an opened device can report it
+  std::string precision;             // supported precisions of products: "f32, bf16"
 };
 
 /// The matrices to stream in every act, if memory is too small for all of them.
@@ -135,14 +136,14 @@ class Device {
   }
   /// Allocates slots, filled with zeros. Errors: out_of_memory.
   virtual Status allocate(Slots& slots) = 0;
-  /// The caller may reuse the bytes at once, except those of host_memory.
+  /// Fills a slot. The caller may reuse `data` at once, unless it is in host_memory.
   virtual void set(const Slot& slot, const void* data, std::size_t size) = 0;
   virtual void get(const Slot& slot, void* data, std::size_t size) const = 0;
-  /// Memory that the device reads by itself, so that `set` copies none of it: its values must stay until a result that
-  /// used them was read. It may outlive the device. Any thread may ask for it. Null if the device or its memory cannot
-  /// do this.
+  /// Memory that the device reads directly, so `set` does not copy it: leave its values unchanged until a result that
+  /// uses them is read. It may outlive the device. Any thread may call this function. Null if the device or its memory
+  /// cannot do this.
   virtual std::shared_ptr<float[]> host_memory(std::size_t /*n*/) { return nullptr; }
-  /// Bytes that were sent ahead to a device while it computes. They must stay until a result that used them was read.
+  /// Bytes that were sent ahead to a device while it computes. Keep this object until a result that uses them is read.
   class Sent {
    public:
     virtual ~Sent() = default;
@@ -150,7 +151,7 @@ class Device {
   /// Copies bytes to the device ahead of their use; the caller may reuse them afterwards. Any thread may call it. Null
   /// if the device or its memory cannot do this: set the slot instead. A failure is reported by the device's next call.
   virtual std::unique_ptr<Sent> send(const void* /*data*/, std::size_t /*size*/) { return nullptr; }
-  /// Fills a slot with bytes that this device sent, as many as the slot has.
+  /// Fills a slot with bytes from an earlier `send` of this device. Their number must be the slot's size.
   virtual void take(const Slot& /*slot*/, const Sent& /*sent*/) {}
   /// The first error of the device; every later call fails too. Errors: device, out_of_memory.
   virtual Status failure() const { return {}; }
@@ -161,7 +162,7 @@ class Device {
   /// For display: "cpu, 2 threads".
   virtual std::string name() const = 0;
   virtual int n_thread() const = 0;
-  /// Whether it computes on the cores that also prepare observations.
+  /// Whether the device computes on the CPU cores that also preprocess observations.
   virtual bool is_host() const { return true; }
   /// The kernels' name, as `--kernels` takes it.
   virtual std::string kernels() const = 0;
@@ -169,20 +170,20 @@ class Device {
   virtual Features features() const { return {}; }
   /// The precision of the large products.
   virtual Precision precision() const = 0;
-  /// How large matrices are rounded at load.
+  /// The rounding that large matrices get at load.
   virtual Rounding rounding() const = 0;
-  /// Whether products of bf16 would be faster on it (graph/rounding.h).
+  /// Whether bf16 products would be faster on this device (graph/rounding.h).
   virtual bool has_bf16() const = 0;
-  /// Which kernel multiplies how many matrices, and their encoding: `avx2 (98 bf16)`.
+  /// The kernels of the matrix products, with the number of matrices per encoding: `avx2 (98 bf16)`.
   virtual const std::string& linear_kernels() const = 0;
   /// Bytes of parameters, and bytes that running programs share.
   virtual std::size_t weights_size() const = 0;
   virtual std::size_t working_size() const = 0;
   /// Starts counting the time of each kind of operation from zero, or stops.
   virtual void count_times(bool /*on*/) {}
-  /// The counted times, in seconds summed over threads. Empty if the device cannot tell.
+  /// The counted times, in seconds summed over threads. Empty if the device does not count times.
   virtual std::vector<std::pair<std::string, double>> times() const { return {}; }
-  /// Faults the shared memory in now, so that no request waits for page faults.
+  /// Touches all pages of the shared memory, so that no request waits for page faults.
   virtual void touch() {}
 
   std::vector<float> get(const Slot& slot) const {

@@ -49,12 +49,12 @@ struct Node {
 
 inline const Shape& Tensor::shape() const { return node_->shape; }
 
-/// Decides by its path whether a value is recorded. An empty function records nothing.
+/// Decides by a value's path whether to record the value. An empty function records nothing.
 using TapFilter = std::function<bool(const std::string& path)>;
 /// Returns the slot that replaces the value of a path, or null to keep the value.
 using Injector = std::function<const Slot*(const std::string& path, Tensor value)>;
 
-/// The recorded operations in order. A graph knows no device; a lowering compiles it to a Program.
+/// The recorded operations in order. A graph is independent of the device; a lowering compiles it to a Program.
 class Graph {
  public:
   /// `slots` receives values that outlive a run.
@@ -67,10 +67,10 @@ class Graph {
 
   Tensor input(const Slot* slot);
   Tensor parameter(const Param* param);
-  /// Values that depend on shapes alone, made once per graph for each `key`.
+  /// Values that depend only on shapes. `make` is called once per graph for each `key`.
   Tensor constant(const std::string& key, const Shape& shape, const std::function<std::vector<float>()>& make);
   Tensor constant_ids(const std::string& key, const std::function<std::vector<std::int32_t>()>& make);
-  /// Values that are read once.
+  /// The same without a key, for values that one operation reads.
   Tensor constant(std::vector<float> values, const Shape& shape);
 
   /// Gives `value` its path and records it if the filter says so. Later operations must use the returned tensor, which
@@ -78,10 +78,10 @@ class Graph {
   Tensor name(const std::string& path, Tensor value);
   void write(Tensor value, Slot* slot) { add(op::Write{slot}, {value}); }
   Slots& slots() const { return slots_; }
-  /// A number that no other graph has or had.
+  /// A number unique to this graph in the process.
   std::uint64_t serial() const { return serial_; }
 
-  /// Ends a stage: everything recorded so far is computed before what follows, and a run notes the time.
+  /// Ends a stage: a run computes everything recorded so far before the rest and records the time.
   void end_stage(std::string name) { stages_.push_back({std::move(name), nodes_.size()}); }
   struct Stage {
     std::string name;

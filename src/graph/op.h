@@ -34,8 +34,8 @@ struct Parameter {
 
 /// How a product is defined.
 ///
-/// floats: sums of products of floats, which a device rounds as its precision says.
-/// int8_rows: the weight is ternary, and x becomes int8 first: of each row a = max |x|, at least 1e-5,
+/// floats: sums of products of floats, rounded to the device's precision.
+/// int8_rows: the weight is ternary, and each row of x is quantized to int8: a = max |x|, at least 1e-5,
 /// s = (1 / a) * 127, and q = x * s rounded to the nearest, ties to even. Then W x is float(sum of products of codes) *
 /// (scale of W / s). Every operation is rounded to float32 by itself; the sums are exact.
 /// Source: BitVLA modeling_bitnet.py BitLinear, WeightQuant, ActQuant.
@@ -58,7 +58,7 @@ struct Gather {
 };
 
 enum class NormKind { layer, rms };
-/// x, then weight and bias [d] where there are any. layer: (x - mean) / sqrt(variance + eps) * weight + bias over the
+/// Operands: x, then optional weight and bias [d]. layer: (x - mean) / sqrt(variance + eps) * weight + bias over the
 /// first dimension; rms: x / sqrt(mean(x^2) + eps) * weight + bias.
 struct Norm {
   static constexpr const char* kName = "norm";

@@ -12,8 +12,8 @@ namespace vla {
 enum class Rounding { none, bf16, int8, int4, float32 };
 
 /// The encoding of a parameter in memory. int8 and int4 have one scale per matrix row. Matrices with fewer than 144
-/// inputs or outputs keep their encoding: they take too little time to be worth an error, and padded states and actions
-/// have up to 132 elements (GR00T N1.7).
+/// inputs or outputs keep their encoding: they take too little time to be worth a rounding error, and padded states and
+/// actions have up to 132 elements (GR00T N1.7).
 Encoding resident_encoding(const Param& param, Rounding rounding);
 
 /// Errors: unsupported if no matrix would get the requested encoding.

@@ -9,7 +9,7 @@ namespace vla {
 /// The result's shape and type, if the operands fit.
 struct ShapeCheck {
   bool fits;
-  Shape shape = {1, 1, 1, 1};  // of the result
+  Shape shape = {1, 1, 1, 1};  // the result's shape
   DType type = DType::f32;
 };
 

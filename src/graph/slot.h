@@ -19,14 +19,14 @@ using Shape = std::array<std::int64_t, 4>;
 constexpr std::int64_t count(const Shape& shape) { return shape[0] * shape[1] * shape[2] * shape[3]; }
 /// "[720, 50]": all dimensions up to the last that is not 1.
 std::string shape_text(const Shape& shape);
-/// The same as elements.
+/// The same sizes as a vector.
 std::vector<std::int64_t> dims(const Shape& shape);
 
 /// A tensor that outlives the graphs that read and write it: inputs, the cache, x, tables made at load. Float32 or i32.
 struct Slot {
   DType type = DType::f32;
   Shape shape = {1, 1, 1, 1};
-  void* place = nullptr;  // its place on the device, once memory is allocated
+  void* place = nullptr;  // the slot's address on the device; null until its memory is allocated
 
   std::size_t size() const { return static_cast<std::size_t>(count(shape)) * 4; }
 };
@@ -39,7 +39,7 @@ class Slots {
   Slot* add_i32(const Shape& shape) { return add(DType::i32, shape); }
 
   std::deque<Slot>& all() { return slots_; }
-  /// Bytes of the memory.
+  /// Size in bytes of the memory that holds the slots.
   std::size_t size() const { return size_; }
   /// Takes ownership of the memory that holds the slots, `size` bytes.
   void hold(std::shared_ptr<void> memory, std::size_t size) { memory_ = std::move(memory), size_ = size; }

@@ -6,9 +6,9 @@
 
 namespace vla {
 
-/// How much work a computation is. `flop` counts two for each multiply-add of matrix and attention products; other
-/// operations take time but no peak is measured in their units. `bytes` counts every operand and result once per
-/// operation of the program, in its stored dtype, so a fused operation moves fewer.
+/// The work of a computation. `flop` counts two for each multiply-add of matrix and attention products; other
+/// operations are not counted, because no peak rate is measured in their units. `bytes` counts every operand and result
+/// once per operation of the program, in its stored dtype, so a fused operation moves fewer.
 struct Work {
   double flop = 0, bytes = 0;
   double int8 = 0;     // share of flop that multiplies int8 codes
@@ -21,7 +21,7 @@ struct Work {
     weights += other.weights;
     return *this;
   }
-  /// The same n times.
+  /// The work of n repetitions.
   Work times(int n) const { return {n * flop, n * bytes, n * int8, n * weights}; }
 };
 

@@ -30,7 +30,7 @@ struct HeadRows {
 struct PackJob {
   std::int64_t d_head, n_head_kv, n_key, n_batch;
   HeadRows k, v;
-  RowPrep prep;  // of keys
+  RowPrep prep;  // applied to keys
   std::byte* packed;
 
   std::int64_t n_unit() const { return n_head_kv * n_batch; }
@@ -49,13 +49,13 @@ struct AttentionJob {
   std::int64_t d_head, n_head, n_head_kv, n_query, n_key, n_batch;
   float scale;
   HeadRows q;
-  RowPrep prep;       // of queries
+  RowPrep prep;       // applied to queries
   const float* mask;  // [n_key, n_query], any values except +infinity, or null
   int n_segment;
   Segment segment[kMaxSegment];
   std::byte* out;  // floats [d_head, n_head, n_query, n_batch], or bf16 in out_layout
   RoundedLayout out_layout = RoundedLayout::none;
-  std::int64_t block_rows;  // made by AttentionKernel::cut
+  std::int64_t block_rows;  // set by AttentionKernel::cut
 
   /// Query heads per key head. Their queries are rows of the same product.
   std::int64_t n_row() const { return n_head / n_head_kv * n_query; }
@@ -64,17 +64,17 @@ struct AttentionJob {
 
 /// Attention for one instruction set: softmax(q k * scale + mask) v in float32, heads concatenated, without a score
 /// matrix in memory. It skips chunks of keys that are masked for a whole block of queries. Other arithmetics, such as
-/// bf16 tiles, are other rows of the table.
+/// bf16 tiles, have kernels of their own.
 struct AttentionKernel {
   /// Bytes of packed keys and values.
   std::size_t (*packed_size)(const PackJob& job);
   std::int64_t (*n_pack)(const PackJob& job);
   void (*pack)(const PackJob& job, std::int64_t item);
-  /// Splits a job into items for that many threads. Returns how many.
+  /// Splits a job into items for that many threads. Returns the number of items.
   std::int64_t (*cut)(AttentionJob& job, int n_thread);
   void (*run)(const AttentionJob& job, std::int64_t item);
-  /// The layout that `out` may have in place of float32 rows, with rows a multiple of kTileSide long; and the layout
-  /// that unprocessed queries, keys and values may have.
+  /// The bf16 layout that `out` may have instead of float32 rows, if rows are a multiple of kTileSide long. Queries,
+  /// keys and values without a prep may have it too.
   RoundedLayout rounded;
 };
 

@@ -53,7 +53,7 @@ class AttentionPanels {
       P::put_values(rows + i, first, panels.width(i), packed + panels.values(unit) + i * panels.n_key);
   }
 
-  /// Writes a token's d_head elements, padded with zeros to `n_padded`. It may write up to two vectors further.
+  /// Writes a token's d_head elements, padded with zeros to `n_padded`. May write up to two vectors past the end.
   VLA_INLINE void copy_row(const HeadRows& rows, std::int64_t head, std::int64_t token, std::int64_t batch,
                            const RowPrep& prep, std::int64_t n_padded, Number* to) const {
     if constexpr (P::kRounded != RoundedLayout::none)

@@ -22,7 +22,7 @@ struct FloatProducts {
   using Number = float;
   struct Session {};
   static constexpr int kTile = kRowsOfTile, kRows = 24, kPart = kRows;  // rows of a tile, a block, a pass
-  static constexpr int kKeys = 128;                                     // of a chunk
+  static constexpr int kKeys = 128;                                     // keys of a chunk
   static constexpr int kVectors = kVectorsOfPanel, kPanel = kVectors * V::width;
   static constexpr int kMinPanel = V::width, kDepth = 1;  // columns of a panel; unit of the depth
   static constexpr bool kBeside = false;
@@ -32,7 +32,7 @@ struct FloatProducts {
   static constexpr float kLogOfE = 1, kSlack = 0;
   static VLA_INLINE Float power(Float x) { return exp_of_negative<V>(x); }
 
-  /// Two vectors as elements.
+  /// Stores two vectors as elements.
   static VLA_INLINE void store(Number* to, Float a, Float b) {
     V::store(to, a);
     V::store(to + V::width, b);
@@ -133,7 +133,7 @@ struct PairPanels {
       }
   }
 
-  /// Here pairs are elements of two consecutive rows.
+  /// A pair consists of the elements of two consecutive rows in one column.
   static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t, Number* panel) {
     panel += place(k, 0);
     for (int i = 0; i < kPanel; i += 2)
@@ -157,8 +157,8 @@ struct PairPanels {
   static VLA_INLINE void store_words(Number* p, Float x) { std::memcpy(p, &x, sizeof(x)); }
 };
 
-/// A vector instruction adds both products of a pair: `Pairs` has add(sum, pairs, pairs). Rows of a tile by 32 columns;
-/// a pair of the row is broadcast.
+/// Multiplies kRowsOfTile rows by 32 columns with a vector instruction that adds both products of a pair; a pair of the
+/// row is broadcast. `Pairs` also has add(sum, pairs, pairs).
 template <class V, int kRowsOfTile, class Pairs>
 struct VectorPairProducts : PairPanels<V, Pairs> {
   using Base = PairPanels<V, Pairs>;
@@ -208,7 +208,7 @@ struct PairProducts : PairPanels<V, Tile> {
   using Session = typename Tile::Session;
   using Base::kDepth, Base::kPanel;
   static constexpr int kTile = 32, kRows = 64, kPart = 32, kKeys = 256;
-  static constexpr bool kBeside = true;  // products are queued and computed beside other work
+  static constexpr bool kBeside = true;  // products are queued and computed while other work runs
   static constexpr RoundedLayout kRounded = RoundedLayout::tiles;
 
   /// Queued products, computed a step at a time between other work: the tile unit runs while vector instructions wait

@@ -10,8 +10,8 @@
 /// by keys in chunks: a chunk's scores stay in the L1 and L2 caches, become weights there, and are added to the block's
 /// output. The output is rescaled whenever a much larger score appears.
 ///
-/// One pass computes some of the rows with one chunk. If products run on a unit of their own (P::kBeside), those of
-/// neighbouring passes are computed while vector instructions turn scores into weights.
+/// One pass computes some of the rows with one chunk. If a separate unit computes products (P::kBeside), the products
+/// of neighbouring passes are computed while vector instructions turn scores into weights.
 ///
 /// Source of the method: Dao et al., FlashAttention (2022); Milakov and Gimelshein, Online normalizer (2018).
 namespace vla::kernels {
@@ -64,10 +64,10 @@ class AttentionTile {
     const Panels query_panels = Panels(job.d_head, 0);
     const int n_row;
     const int n_tiled = static_cast<int>(round_up(n_row, kTile));
-    std::int64_t head[kRows], query[kRows];  // of each row
+    std::int64_t head[kRows], query[kRows];  // each row's head and query
     typename P::Work work;
     alignas(64) float mixed[kRows * kHeadStride];
-    // State of one pass; of two, if the products of the next are computed beside the weights of this one.
+    // State of one pass, or of two if the next pass's products are computed together with this pass's weights.
     static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kPart * kKeyStride;
     // Scores, later weights in the same place. Rows without a query have arbitrary values; their products go to rows
     // that are not read.
@@ -96,7 +96,7 @@ class AttentionTile {
       int n = 0;
       Seen seen = Seen::none;
       bool sum = false;                    // adds to earlier chunks' output
-      int first = 0, end = 0, buffer = 0;  // first row, number of rows, and the state with their scores
+      int first = 0, end = 0, buffer = 0;  // rows first to end - 1, and the index of the buffer with their scores
     };
     float* scores(const Pass& pass, int row) {
       return score + pass.buffer * kBufferSize + (row - pass.first) * kKeyStride;
@@ -133,7 +133,8 @@ class AttentionTile {
       for (int r = 0; r < kRowVectors; r += kWidth) V::store(base + r, V::set(kNever));
     }
 
-    /// The first pass of the next chunk, at or after `key`, of which the block's queries see any key; or none.
+    /// Returns the first pass of the next chunk at or after `key` in which the block's queries see a key. The pass has
+    /// n = 0 if there is no such chunk.
     Pass pass_from(int i_segment, std::int64_t key) const {
       for (; i_segment < job.n_segment; ++i_segment, key = 0) {
         const AttentionJob::Segment& segment = job.segment[i_segment];
@@ -160,7 +161,7 @@ class AttentionTile {
       return next;
     }
 
-    /// Whether the block's queries see all, some or none of a chunk.
+    /// Whether the block's queries see all, some or none of a chunk's keys.
     Seen look(std::int64_t key, int n) const {
       bool none = true, all = true;
       for (int r = 0; r < n_row && (none || all); ++r) {
@@ -219,8 +220,8 @@ class AttentionTile {
       }
     }
 
-    /// Scales scores by `factor` to logarithms of weights, for at most kWidth rows starting at `first`, relative to the
-    /// largest score so far or to one nearly as large.
+    /// Turns the scores of at most kWidth rows, starting at `first`, into weights. Scores times `factor` are the
+    /// logarithms of weights, relative to the largest score so far or to one nearly as large.
     VLA_INLINE void weigh_rows(int first, const Pass& pass, float factor, int n_step) {
       const int end = pass.end - first < kWidth ? pass.end : first + kWidth;
       Float tops[kWidth] = {};
@@ -303,7 +304,7 @@ class AttentionTile {
       }
     }
 
-    /// Elements of one head in a row, starting at a column.
+    /// Writes the elements of one head to a row, starting at a column.
     void write_rounded(const float* from, float factor, std::int64_t row, std::int64_t column) const {
       alignas(64) Number room[kHeadStride];
       for (std::int64_t i = 0; i < job.d_head; i += 2 * kWidth)

@@ -22,7 +22,7 @@ struct ChannelAttentionJob {
   std::int64_t n_unit() const { return n_group * n_view; }
 };
 
-/// One group of one view.
+/// Computes one group of one view.
 using ChannelAttentionKernel = void (*)(const ChannelAttentionJob& job, std::int64_t unit);
 
 template <class V>

@@ -9,8 +9,8 @@
 
 namespace vla::kernels {
 
-/// Words of four bytes from one place to another: rows of shape[0] words, in up to five more dimensions. Strides are in
-/// words; in a row of the result words follow each other.
+/// Copies words of four bytes: rows of shape[0] words, in up to five more dimensions. Strides are in words. The words
+/// of a result's row are contiguous.
 struct CopyJob {
   using Extents = std::array<std::int64_t, 6>;
 
@@ -21,7 +21,7 @@ struct CopyJob {
   std::int64_t n_row() const { return shape[1] * shape[2] * shape[3] * shape[4] * shape[5]; }
 
   void copy_rows(std::int64_t begin, std::int64_t end) const {
-    Extents at = {};  // the row as an index in each dimension
+    Extents at = {};  // the row's index in each dimension
     std::int64_t rest = begin;
     for (std::size_t i = 1; i < at.size(); ++i) at[i] = rest % shape[i], rest /= shape[i];
     for (std::int64_t row = begin; row < end; ++row) {

@@ -26,8 +26,8 @@ struct CpuKernels {
   RowKernel activation(Activation activation) const;
 };
 
-/// The kernels for these features; null for plain ggml operations. Kernels that round to bf16 (kernel_set.h) also do so
-/// in attention, with sums in float32, like PyTorch with a bf16 model.
+/// The kernels for these features; null for the set `ggml`, which uses ggml's operations. Kernels that round to bf16
+/// (kernel_set.h) also round in attention, with sums in float32, like PyTorch with a bf16 model.
 const CpuKernels* cpu_kernels(Features use);
 
 }  // namespace vla::kernels

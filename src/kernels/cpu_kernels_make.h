@@ -9,7 +9,7 @@
 namespace vla::kernels {
 
 /// The kernels of one instruction set, all from the same templates. Include this only in a file compiled for V's
-/// instructions. `Products`: those of attention, a type of attention_products.h.
+/// instructions. `Products`: a type of attention_products.h, for attention.
 template <class Products>
 class CpuKernelsMaker {
   using V = typename Products::Vector;

@@ -14,8 +14,8 @@ namespace vla::kernels {
 namespace {
 
 /// How long a worker without work spins before it sleeps: longer than most operations on one thread, so that workers
-/// stay awake through a chain of them, and short beside a time slice, since the system takes a spinning core for a busy
-/// one.
+/// stay awake through a chain of such operations, and much shorter than a time slice, because the system counts a
+/// spinning core as busy.
 constexpr std::chrono::microseconds kSpin(20);
 
 constexpr std::uint64_t kCountBits = 24, kCountMask = (std::uint64_t{1} << kCountBits) - 1;
@@ -124,7 +124,7 @@ bool Executor::has_work() const {
   });
 }
 
-/// Takes items while there are any, first from its own range. False if there were none.
+/// Takes items while there are any, first from the worker's own range. Returns false if there were none.
 bool Executor::work(Worker& worker) {
   bool worked = false;
   for (int i = 0; i < n_stretch_; ++i) {
@@ -132,8 +132,8 @@ bool Executor::work(Worker& worker) {
     std::uint64_t left = stretch.left.load(std::memory_order_acquire);
     while ((left & kCountMask) != 0) {
       if (!stretch.left.compare_exchange_weak(left, left - 1, std::memory_order_acq_rel)) continue;
-      // Until finish_item the phase cannot end. Scratch memory may have grown since the last run, but not while an item
-      // is held.
+      // The phase cannot end before this item is finished. Scratch memory may have grown since the last run, but does
+      // not grow while a worker holds an item.
       worker.begin(left >> kCountBits, scratch_.get() + static_cast<std::size_t>(worker.index) * scratch_size_);
       run_item(stretch.end - static_cast<std::int64_t>(left & kCountMask), worker);
       finish_item();

@@ -64,7 +64,7 @@ class Task {
   virtual ~Task() = default;
   virtual void run(std::int64_t item, Worker& worker) const = 0;
 
-  /// Runs an item. Its time counts for the task's kind while the clock runs.
+  /// Runs an item. While the clock runs, adds the item's time to the task's kind.
   void take(std::int64_t item, Worker& worker) const {
     if (clock == nullptr || !clock->runs.load(std::memory_order_relaxed)) return run(item, worker);
     const auto start = std::chrono::steady_clock::now();
@@ -90,19 +90,19 @@ std::unique_ptr<Task> task_of(std::int64_t n_item, Run run) {
   return task;
 }
 
-/// Tasks that do not depend on each other: their items are taken side by side.
+/// Tasks that do not depend on each other: their items may run at the same time.
 struct Phase {
   std::vector<const Task*> tasks;
-  std::chrono::steady_clock::time_point* done = nullptr;  // when the last run finished the last item, if asked
+  std::chrono::steady_clock::time_point* done = nullptr;  // if set, receives the time when the last item ended
 };
 
 /// A thread pool that runs phases in order. A phase is done when its *items* are done, so a worker that the system
-/// suspends between two items delays nobody. The worker that finishes the last item opens the next phase. A worker
-/// without work spins briefly, then sleeps until a phase of several items opens; an idle executor uses no processor
-/// time.
+/// suspends between two items delays no other worker. The worker that finishes the last item opens the next phase. A
+/// worker without work spins briefly, then sleeps until a phase of several items opens; an idle executor uses no
+/// processor time.
 ///
-/// Each worker has its own range of items, the same in every run so that operands may still be in its caches, and then
-/// helps with the others' items.
+/// Each worker has its own range of items, the same in every run so that operands may still be in its caches. After its
+/// own range it takes items from other workers' ranges.
 class Executor {
  public:
   /// The executor of `n_thread` threads, including the caller of `run`. Engines of one process with the same number
@@ -123,8 +123,8 @@ class Executor {
 
  private:
   static constexpr int kMaxStretches = 64;
-  /// Items left in a worker's range, with the phase number in the upper bits: a suspended worker cannot take an item of
-  /// a later phase for one of an earlier phase.
+  /// Items left in a worker's range, with the phase number in the upper bits. The number keeps a suspended worker from
+  /// mistaking an item of a later phase for one of an earlier phase.
   struct alignas(64) Stretch {
     std::atomic<std::uint64_t> left = 0;
     std::int64_t end = 0;  // end of the range
@@ -142,9 +142,9 @@ class Executor {
   void wake(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleeping, bool all);
 
   const int n_thread_, n_stretch_;
-  std::mutex turn_;  // held by the caller of `run`
+  std::mutex turn_;  // held during `run`, `reserve` and `touch`
   std::vector<std::thread> threads_;
-  std::atomic<std::size_t> scratch_size_ = 0;  // grown while others load
+  std::atomic<std::size_t> scratch_size_ = 0;  // may grow while another thread reads it
   struct Free {
     void operator()(std::byte* memory) const;
   };
@@ -157,7 +157,7 @@ class Executor {
   Stretch stretches_[kMaxStretches];
   alignas(64) std::atomic<std::int64_t> n_left_ = 0;  // unfinished items of the phase
 
-  // Two words to sleep on: workers wait for a phase, the caller for a phase or the end.
+  // Two words to sleep on: workers wait for a phase, the caller of `run` for a phase or the end of the run.
   alignas(64) std::atomic<std::uint32_t> opened_ = 0;
   std::atomic<int> n_sleeping_ = 0;
   alignas(64) std::atomic<std::uint32_t> caller_word_ = 0;

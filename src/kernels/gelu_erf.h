@@ -14,8 +14,8 @@ namespace normal_tail {
 
 /// Piecewise minimax approximation of g: relative error 2^-25.7. Pieces of y end at 0.5, 1, 2, 3, 5, 7, 11 and 15,
 /// where the exponent and first bit of 1 + y change; these bits are the index, so [0, 0.5] is row seven. In a piece g =
-/// start + slope y + sum of c[i] (y - center)^(i + 1). `center` is a point near the middle whose g is a float32 to
-/// 2^-34, so `start` rounds nothing. Near zero g is y / 2 plus terms of y^2.
+/// start + slope y + sum of c[i] (y - center)^(i + 1). `center` is a point near the middle where g equals a float32 to
+/// within 2^-34, so `start` has no rounding error. Near zero g is y / 2 plus terms of y^2.
 struct Pieces {
   float center[8], slope[8], start[8], c[7][8];
 };

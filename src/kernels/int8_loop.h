@@ -7,16 +7,16 @@
 #include "kernels/tile_heights.h"
 
 /// The loop around a tile of integer products of x's int8 codes and ternary, int4 or int8 weights: how work is split
-/// into items, and what stays in which cache.
+/// into items, and which operands stay in which cache.
 ///
-/// A panel is taken a step of the depth at a time. The step stays in a cache while all rows of a block of x pass by.
-/// Weights of two or four bits are expanded to bytes once per step; for few rows the tile unpacks them itself. Sums are
-/// integers, so their order does not matter.
+/// A panel is multiplied a step of the depth at a time. The step stays in a cache while all rows of a block of x are
+/// multiplied by it. Weights of two or four bits are expanded to bytes once per step; for few rows the tile unpacks
+/// them itself. Sums are integers, so their order does not matter.
 namespace vla::kernels {
 
-/// Turns a row's sums into values; the weights have an offset: float(sum) * (scale of W, or of its column / s of the
-/// row).
-/// Integers wrap: a prediction (lower/cpu/predict.cpp) multiplies rows that nothing has rounded.
+/// Turns a row's sums into values: subtracts the weights' offset, then computes float(sum) * (scale / s), with the
+/// scale of W or of the column and the row's s. Integers wrap, because a prediction (lower/cpu/predict.cpp) multiplies
+/// rows that were never quantized.
 template <class V, class Weights, int kColumns, int kOffset>
 VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const RowScale& row, const std::int32_t* from,
                            float* to) {
@@ -44,22 +44,21 @@ constexpr bool kHasPanel = requires {
 template <class Tile, class Weights>
 using StripsOf = typename Weights::template Strips<Tile::kColumns / static_cast<int>(Int8Panels::kColumns)>;
 
-/// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows and kBlockKiB (of the block of x,
-/// at most), kStep (of the depth, most), kEven (tiles of equal height), Session (held while a thread works), kSigned
-/// (sums are of the weights themselves, without their offset), kLayout (of a y that is rounded, as LinearStripes says),
-/// and
+/// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows and kBlockKiB (largest block of x),
+/// kStep (largest step of the depth), kEven (tiles of equal height), Session (held while a thread works), kSigned (sums
+/// are of the weights themselves, without their offset), kLayout (layout of a rounded y, see LinearStripes), and
 ///   multiply(n_row, x, x_stride, strips, depth, sums, add, between)
-///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and of the panels' own Strips. It may read
-///     and write rows up to kRows.
-/// Where products have a unit of their own (kBeside), multiply calls between() for every 64 of the depth before it
-/// writes sums: some rows of the tile before are finished there.
-/// Where registers are left for it (kFirstExpands), the first tile of many rows expands bytes while it multiplies.
-/// Where an instruction takes two rows by two columns (kPairs), rows are copied in pairs and elements of any width
-/// rearranged, both by the tile: pair(first, second, depth, to) and expand(strips, depth, to); then multiply has the
-/// latter's bytes for `strips` and no between().
-/// A tile may have a Panel of its own, of kSize bytes at most, for many rows: expand(strips, depth, to) makes it of a
-/// step, and multiply has it for `strips`. A file that includes this is compiled with -ffp-contract=off: what follows
-/// the sums is rounded one by one.
+///     sums [kColumns] x n_row <= kRows, += if `add`. `strips` are ExpandedStrips or the panels' own Strips. It may
+///     read and write rows up to kRows.
+/// kBeside: a separate unit computes products. multiply calls between() once for every 64 of the depth, before it
+/// writes sums; between() finishes some rows of the previous tile.
+/// kFirstExpands: the first tile of many rows expands weights to bytes while it multiplies, if registers suffice.
+/// kPairs: an instruction takes two rows by two columns. The tile copies rows in pairs with pair(first, second, depth,
+/// to) and rearranges weights of any width with expand(strips, depth, to). multiply gets the bytes of expand instead of
+/// `strips`, and no between().
+/// Panel: the tile's own format of weights for many rows, at most kSize bytes. expand(strips, depth, to) converts a
+/// step to it, and multiply gets it instead of `strips`.
+/// Compile a file that includes this with -ffp-contract=off, because each operation after the sums rounds separately.
 template <class Tile, class Weights>
 concept Int8Tile = requires {
   typename Tile::V::Int;
@@ -90,8 +89,8 @@ class Int8Loop {
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
   static constexpr int kStrips = Tile::kColumns / static_cast<int>(Int8Panels::kColumns);
   using Numbers = StripsOf<Tile, Weights>;
-  static constexpr std::int64_t kFewRows = 32;   // which the tile unpacks weights for
-  static constexpr std::int64_t kMinItems = 16;  // for each thread, where there are so many
+  static constexpr std::int64_t kFewRows = 32;   // up to this many rows, the tile unpacks weights itself
+  static constexpr std::int64_t kMinItems = 16;  // per thread, if there are that many
   static constexpr bool kPacked = !std::is_same_v<Weights, BytePanels>;
   static constexpr bool kFirstExpands = requires { Tile::kFirstExpands; };
   static constexpr std::int32_t kOffset = Tile::kSigned ? 0 : Weights::kOffset;
@@ -102,7 +101,8 @@ class Int8Loop {
   }
 
   struct Scratch {
-    // In pairs: the rows of x in the block. Items of one block are consecutive, so a worker copies it once.
+    // For kPairs: the first row of the copied block of x. Items of one block are consecutive, so a worker copies it
+    // once.
     std::int64_t row;
     alignas(64) std::byte x[kPairs ? (Tile::kBlockKiB << 10) + (kRows + 1) * quantized_stride(kMaxPairedDepth) : 1];
     alignas(64) std::byte panel[panel_size()];
@@ -112,7 +112,7 @@ class Int8Loop {
   };
 
  public:
-  /// The kernel table's row for this tile. The quantizer of x computes its norm, of any width.
+  /// The kernel table's row for this tile. The quantizer of x also computes the norm of x, of any width.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use)) {
     return {
         .name = name,
@@ -197,7 +197,7 @@ class Int8Loop {
     void finish() { finish(n_row); }
   };
 
-  /// Sums of the products in a panel's columns.
+  /// Sums the products in a panel's columns, and finishes each tile whose sums are complete.
   VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, bool gate) {
     const std::int64_t n_tile = ceil_div(s.n_row, kRows), depth = quantized_depth(job_.d_in);
     const std::int64_t step = even_block(depth, Tile::kStep, kQuantizedUnit);

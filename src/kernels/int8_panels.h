@@ -8,12 +8,12 @@
 #include "kernels/linear_kernel.h"
 #include "kernels/quantized.h"
 
-/// How kernels store a ternary, int4 or int8 matrix, from load on.
+/// Memory layout of a packed ternary, int4 or int8 matrix.
 ///
 /// A *strip* holds 16 columns of the product (rows of W) over the whole depth (d_in). Kernels multiply one line of 64
 /// bytes at a time: four consecutive elements of every column, as instructions that sum four byte products take them.
-/// Elements may be stored with an offset, which is subtracted from the sums. Strips are padded with zeros to a multiple
-/// of four and the depth to 64, where x has zeros too.
+/// Elements may be stored with an offset, which is subtracted from the sums. The number of strips is padded to a
+/// multiple of four and the depth to a multiple of 64, where x has zeros too.
 namespace vla::kernels {
 
 template <class Element, std::size_t kBytes>
@@ -49,7 +49,7 @@ struct BytePanels : Int8Panels {
 
 /// How a tile reads the elements of a panel of kStrips, with their offset. load(k, s, i, byte) returns a vector,
 /// starting at a byte, of the line with elements k + 4 s to k + 4 s + 3 of strip i. k is a multiple of 16 and all
-/// elements are in one block of 64. Here lines are stored as they are multiplied.
+/// elements are in one block of 64. BytePanels stores lines as they are multiplied.
 template <int kStrips>
 struct BytePanels::Strips {
   const std::byte* strips;
@@ -126,7 +126,7 @@ struct Int4Panels : Int8Panels {
   struct Strips;
 };
 
-/// The same for a tile that multiplies codes and scales sums of a block by its step: load returns codes, 1 to 15.
+/// The same for a tile that multiplies codes and then a block's sum by the block's step: load returns codes, 1 to 15.
 struct Int4Codes : Int4Panels {
   template <int kStrips>
   struct Strips;
@@ -149,7 +149,7 @@ struct Int4Codes::Strips {
     std::memcpy(&codes, lines + i * strip + k * 8 + s / 2 * kLine + byte, sizeof(codes));
     return std::bit_cast<Vector>((codes >> s % 2 * 4) & 0x0f0f);
   }
-  /// The step of each column, twice, as 16 bits.
+  /// The step of each column, as two equal numbers of 16 bits.
   template <class Vector>
   VLA_INLINE Vector step(std::int64_t k, int i, int byte) const {
     using Columns = typename VectorOf<std::uint8_t, sizeof(Vector) / 4>::Type;
@@ -186,8 +186,8 @@ struct Int4Panels::Strips : Int4Codes::Strips<kStrips> {
 static_assert(15 * Int4Block::kMaxStep <= 255 && Int4Block::kMost * Int4Block::kMaxStep < 128);
 
 /// Elements of a panel expanded to bytes: lines of 64 with four elements of 16 columns, for each strip, then the next
-/// four elements. fetch(k, s, i) prefetches the line that is loaded kAhead groups later; a long step lies in the L2
-/// cache.
+/// four elements. fetch(k, s, i) prefetches the line that is loaded kAhead groups later, because a long step lies in
+/// the L2 cache.
 template <int kStrips, class Packed>
 struct ExpandedStrips {
   static constexpr std::int64_t kAhead = 8;
@@ -210,7 +210,7 @@ struct ExpandedStrips {
   }
 };
 
-/// The same for the first read: writes each loaded vector to the lines.
+/// Used for the first read of a panel: load expands a vector and also writes it to `lines`.
 template <int kStrips, class Packed>
 struct ExpandingStrips {
   std::byte* lines;

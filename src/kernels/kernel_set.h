@@ -42,7 +42,7 @@ inline constexpr KernelSet all[] = {ggml, portable, neon, neon_bf16, avx2, avx51
 
 /// The sets that a processor can run, `ggml` first and the best last.
 std::vector<KernelSet> kernel_sets(Features machine);
-/// Those of this one.
+/// The sets that this processor can run.
 const std::vector<KernelSet>& usable_kernels();
 
 /// The best set that needs only these features.

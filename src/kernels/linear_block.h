@@ -11,8 +11,8 @@
 
 namespace vla::kernels {
 
-/// Two products of tiles, of which the second reads what the first makes. An item is a block of rows that goes through
-/// both. What lies between them begins at `inner` of a thread's scratch memory, behind that of the kernels.
+/// Two products on tiles; the second reads the first one's result. An item is a block of rows that passes through both.
+/// The first one's result is stored in the thread's scratch memory from byte `inner` on, after the kernels' own part.
 struct BlockedTask final : Task {
   const LinearKernel* kernel[2];
   LinearJob job[2];
@@ -23,7 +23,7 @@ struct BlockedTask final : Task {
     const std::int64_t first = n_square * item / n_item * kTileSide;
     const std::int64_t n = min(n_square * (item + 1) / n_item * kTileSide, job[0].n_row) - first;
     LinearJob up = rows_of(job[0], first, n), down = rows_of(job[1], first, n);
-    // Each product starts anew: jobs of other blocks lay at the same addresses.
+    // scratch_from makes each product discard kept scratch contents: jobs of other blocks had the same addresses.
     up.part[up.n_part - 1].y = worker.scratch_from(inner);
     run_all(*kernel[0], up, worker);
     down.x = worker.scratch_from(inner);
@@ -31,7 +31,7 @@ struct BlockedTask final : Task {
   }
 
  private:
-  /// The job for n rows from `first` on, a multiple of kTileSide, since bf16 lies in tiles.
+  /// The job for n rows from `first` on. `first` is a multiple of kTileSide, because bf16 is stored in tiles.
   static LinearJob rows_of(LinearJob job, std::int64_t first, std::int64_t n) {
     const auto offset = [&](DType type, std::int64_t d, std::int64_t stride) {
       return type == DType::bf16 ? 2 * place_in_tiles(first, 0, d)

@@ -24,7 +24,7 @@ struct LinearJob {
     const float* residual;
     std::byte* y;
     std::int64_t d_out;
-    const float* scale = nullptr;  // of a ternary weight, or of each column of an int8 one
+    const float* scale = nullptr;  // one for a ternary weight; one per column for an int8 or int4 weight
     DType y_type = DType::f32;     // or bf16 in the layout of LinearKernel::rounded
   };
   static constexpr int kMaxPart = 3;
@@ -46,13 +46,13 @@ struct LinearJob {
   const std::byte* x;     // n_row rows of d_in elements
   std::int64_t x_stride;  // stride of rows in elements
   Norm norm;              // if set, the product reads the norm of each row
-  Window window = {};     // if its size is not 0: rows are the window's places over the images x, in float32
+  Window window = {};     // if its size is not 0: a row is the window at one place of the images x, in float32
   std::int64_t n_row, d_in;
   int n_part;
   Part part[kMaxPart];
   Activation activation;
   bool ends_in_relu = false;  // applied after the residual
-  /// Of two parts, gate and up, the result activation(gate) * up is stored in the y of up.
+  /// If set, the two parts are gate and up, and activation(gate) * up is stored in the y of up.
   bool gated;
   /// f32; or bf16 in the layout of LinearKernel::rounded, if the kernel rounds its operands; or i8 rows of
   /// LinearKernel::quantize, x_stride bytes apart.

@@ -17,7 +17,7 @@ struct MatrixDesc {
   std::int64_t d_in, d_out;
 };
 
-/// No limit of a depth.
+/// No limit for a depth.
 constexpr std::int64_t kAnyDepth = std::int64_t{1} << 62;
 
 /// One implementation of the matrix product. All of them sum in float32 or exact integers.
@@ -28,13 +28,13 @@ struct LinearKernel {
   /// `stored` and `packed` must be aligned to 32 and 64 bytes.
   void (*pack)(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
   bool (*supports)(const MatrixDesc& desc, Features use);
-  /// Splits a job into items for that many threads. Returns how many.
+  /// Splits a job into items for that many threads. Returns the number of items.
   std::int64_t (*cut)(LinearJob& job, int n_thread);
   void (*run)(const LinearJob& job, std::int64_t item, Worker& worker);
   std::size_t scratch_size;
   std::int64_t max_norm;  // the widest norm of x that the product can compute itself
-  /// Layout of bf16 that x may have if the kernel would round it anyway, and y if its reader would. Products deeper
-  /// than this store y as float32, since y holds their partial sums.
+  /// The bf16 layout that x may have if the kernel would round x anyway, and that y may have if its reader would round
+  /// y. Products deeper than max_rounded_depth store y as float32, because y holds their partial sums.
   RoundedLayout rounded = RoundedLayout::none;
   std::int64_t max_rounded_depth = 0;
   /// The kernel for at most `max_small_batch` rows, which reads the same packed matrix; null if this one computes them
@@ -55,7 +55,7 @@ struct LinearKernel {
 /// The implementations, best first.
 std::span<const LinearKernel* const> linear_kernels();
 
-/// The first row of the table that takes this matrix and needs no other features, or null.
+/// The first kernel of the table that supports this matrix and needs no other features, or null.
 const LinearKernel* choose_linear(const MatrixDesc& desc, Features use);
 
 }  // namespace vla::kernels

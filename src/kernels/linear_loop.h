@@ -11,9 +11,9 @@
 ///
 /// A tile multiplies a few rows of x by the columns of a panel (linear_panels.h) over some of the depth d_in. A block
 /// of rows of x is first copied into L2 with a fixed stride, so that the inner loop does not depend on their addresses
-/// or width. Then panels pass by, a step of the depth at a time; the step stays in L1 while all rows of the block are
-/// multiplied by it. Source of the method: Goto and van de Geijn, Anatomy of High-Performance Matrix Multiplication
-/// (2008).
+/// or width. Then the block is multiplied by one panel after the other, a step of the depth at a time; the step stays
+/// in L1 while all rows of the block are multiplied by it. Source of the method: Goto and van de Geijn, Anatomy of
+/// High-Performance Matrix Multiplication (2008).
 namespace vla::kernels {
 
 /// The part of a panel that is multiplied next.
@@ -54,14 +54,15 @@ class LinearLoop {
   static constexpr RoundedLayout kLayout = Tile::kRounds ? RoundedLayout::rows : RoundedLayout::none;
   using Stripes = LinearStripes<Tile, kLayout>;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
-  static constexpr std::int64_t kGateColumns = 16 * kColumns;  // of a job whose depth takes more than one block
-  static constexpr std::int64_t kMinItems = 16;                // for each thread, where there are so many
+  static constexpr std::int64_t kGateColumns = 16 * kColumns;  // per item, if the depth takes more than one block
+  static constexpr std::int64_t kMinItems = 16;                // per thread, if there are that many
 
   struct Scratch {
-    // The rows of x in the block and their first depth. Items of one block are consecutive, so a worker copies it once.
+    // First row and first depth of the copied block of x. Items of one block are consecutive, so a worker copies it
+    // once.
     std::int64_t row, depth;
     alignas(64) X x[(kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows after the block
-    alignas(64) float row_of_x[Tile::kMaxDepth];             // a row as it is multiplied, if it is computed here
+    alignas(64) float row_of_x[Tile::kMaxDepth];             // a row of x after its norm, or a window's elements
     alignas(64) float sums[(kBlockRows + kRows) * kColumns];
     alignas(64) float gates[(kBlockRows + kRows) * kGateColumns];
   };
@@ -121,7 +122,7 @@ class LinearLoop {
       return r * Tile::kXStride + k;
   }
 
-  /// A block of one row has room for more of the depth, so that memory is read from one end of a panel to the other.
+  /// The largest depth of a block. A block of one row may be deeper, so that a panel is read from one end to the other.
   static std::int64_t max_depth(const LinearJob& job) {
     constexpr std::int64_t kOneRow = 8 * Tile::kMaxDepth;
     static_assert(kOneRow <= kBlockRows / 2 * Tile::kXStride);
@@ -147,7 +148,7 @@ class LinearLoop {
     }
   }
 
-  /// Copies rows [row, row + n_row) of x, starting at depth k, unless an earlier item left them here.
+  /// Copies rows [row, row + n_row) of x, starting at depth k, unless the scratch memory has them from an earlier item.
   void take_rows(std::int64_t row, std::int64_t n_row, std::int64_t k, std::int64_t depth) {
     if (row == scratch_->row && k == scratch_->depth) return;
     scratch_->row = row, scratch_->depth = k;
@@ -166,8 +167,7 @@ class LinearLoop {
     }
   }
 
-  /// Copies the window's elements at a place, starting at depth k; directly into the block if nothing else is done to
-  /// x.
+  /// Copies the window's elements at a place, starting at depth k; directly into the block if X is float.
   void take_place(std::int64_t place, std::int64_t k, std::int64_t depth, X* to) {
     const auto* images = reinterpret_cast<const float*>(job_.x);
     if constexpr (std::is_same_v<X, float>) {

@@ -8,7 +8,7 @@
 #include "kernels/rounded.h"
 #include "kernels/sizes.h"
 
-/// What all product loops share: how a job is split into stripes and tiles, and the epilogue.
+/// Shared by all product loops: how a job is split into stripes and tiles, and the epilogue.
 namespace vla::kernels {
 
 /// The columns of one panel by the rows of a block of x, over a part of the depth.
@@ -49,9 +49,9 @@ struct LinearStripes {
            Layout::size(part.type, k);
   }
 
-  /// The weights that an item reads after panel `panel` at depths k to k + depth. An item takes panels begin to end for
-  /// one block of the depth, then for the next. After its last block these are the weights that the neighbouring item
-  /// starts with.
+  /// The address of the weights that an item reads after panel `panel` at depths k to k + depth. An item takes panels
+  /// begin to end for one block of the depth, then for the next. After its last block, the address is where the next
+  /// item starts.
   static const std::byte* behind(const LinearJob& job, std::int64_t begin, std::int64_t end, std::int64_t panel,
                                  std::int64_t k, std::int64_t depth) {
     const bool ends_block = panel + 1 == end, goes_on = ends_block && k + depth < job.d_in;
@@ -76,8 +76,8 @@ struct LinearStripes {
   }
 
   /// Finishes a tile's sums [kColumns] x n_row, rows first to first + n_row of the stripe: applies the epilogue after
-  /// the last block of the depth, before that stores partial sums in y. Rows of a tile may be finished in several
-  /// calls.
+  /// the last block of the depth, stores partial sums in y after earlier blocks. Rows of a tile may be finished in
+  /// several calls.
   class Finish {
    public:
     Finish() = default;
@@ -94,7 +94,7 @@ struct LinearStripes {
 
     VLA_INLINE void operator()(std::int64_t begin, std::int64_t end) const { (this->*rows_)(begin, end); }
 
-    /// Prefetches what rows begin to end, as far as they exist, read and write as floats.
+    /// Prefetches the floats that rows begin to end read and write; skips rows after the last one.
     VLA_INLINE void fetch(std::int64_t begin, std::int64_t end) const {
       end = min(end, n_row_);
       if (begin < end && job_->part[s_.part].y_type == DType::f32)
@@ -181,7 +181,7 @@ struct LinearStripes {
       }
     }
 
-    /// A row's elements, starting at column i.
+    /// The finished values of a row, starting at column i.
     template <bool kWhole, bool kRounded, Activation kActivation>
     VLA_INLINE typename V::Float value_at(std::int64_t i_row, std::int64_t i) const {
       const std::int64_t r = first_ + i_row, place = (s_.row + r) * d_out_ + s_.column + i;
@@ -202,7 +202,7 @@ struct LinearStripes {
       return value;
     }
 
-    /// Where the stripe's elements of a row are stored.
+    /// The address where a row's elements of the stripe are stored as bf16.
     template <bool kWhole>
     VLA_INLINE std::uint16_t* rounded_row(std::int64_t row, std::int64_t d_out) const {
       auto* y = reinterpret_cast<std::uint16_t*>(y_);
@@ -223,7 +223,7 @@ struct LinearStripes {
     bool ends_in_relu_ = false;
   };
 
-  /// All rows of a tile.
+  /// Finishes all rows of a tile.
   static void finish(const LinearJob& job, const Stripe& s, const float* sums, std::int64_t r, std::int64_t n_row) {
     Finish(job, s, sums, r, n_row)(0, n_row);
   }

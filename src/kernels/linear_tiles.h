@@ -5,19 +5,19 @@
 #include "kernels/linear_panels.h"
 #include "kernels/linear_stripe.h"
 
-/// The loops around tile registers. These multiply so fast that all other work must overlap with them.
+/// The loops around tile registers, which multiply so fast that all other work must overlap with products.
 ///
-/// x is rounded to bf16, as PyTorch rounds the activations of a bf16 layer, and stored in tiles (rounded.h): in place
-/// if the previous product stored it so, else as a copy of some rows in L2. A block of rows is multiplied by one panel
-/// after the other, a step of the depth at a time, which stays in L1. The epilogue of a square of 32 x 32 sums runs a
-/// few rows at a time between the instructions that multiply later squares.
+/// x is rounded to bf16, as PyTorch rounds the activations of a bf16 layer, and stored in tiles (rounded.h). If the
+/// previous product stored x in tiles, it is read in place, else some rows are copied to L2. A block of rows is
+/// multiplied by one panel after the other, a step of the depth at a time; the step stays in L1. The epilogue of a
+/// square of 32 x 32 sums runs a few rows at a time between the instructions that multiply later squares.
 namespace vla::kernels {
 
 /// `Tile` has: V (a type of vec.h), Session (held while a thread works), and
 ///   copy(from, n, to)                 copies n <= 32 elements of x, padded with zeros to 32
 ///   store_rounded(to, vector, left)   stores y as bf16; also (to, vector, vector) if 32 elements are two vectors
 ///   multiply(half, x, panel, n_square, c, add, between)
-///     a square c of sums, += if `add`, or its first 16 rows; calls between() n_square times
+///     a square c of sums, or only its first 16 rows if `half`; += if `add`; calls between() n_square times
 template <class Tile>
 concept SquareTile = requires(const float* from, std::int64_t n, std::uint16_t* to, typename Tile::V::Float vector,
                               const std::uint16_t* x, const std::byte* panel, float* c, void (&between)()) {
@@ -41,11 +41,11 @@ class TileLoop {
 
   static constexpr std::int64_t kMaxRows = 512;     // rows of a block: more rows read a panel fewer times
   static constexpr std::int64_t kMaxX = 512 << 10;  // elements of x in a block, half of L2
-  static constexpr std::int64_t kMaxDepth = 2048;   // rows of such a block
+  static constexpr std::int64_t kMaxDepth = 2048;   // up to this depth, a block has the whole depth
   static constexpr std::int64_t kStep = 512;        // step of the depth: a panel's step stays in L1
-  static constexpr std::int64_t kRowsAhead = 4;     // elements of x and y to prefetch
+  static constexpr std::int64_t kRowsAhead = 4;     // prefetch distance in rows of x and y
   static constexpr std::int64_t kMinItems = 16;     // per thread, if there are that many
-  // A greater depth takes several blocks. An item keeps the sums of a group of panels between them, and each group
+  // A greater depth takes several blocks. Between blocks an item keeps the sums of its group of panels. Each group
   // reads the whole block of x.
   static constexpr std::int64_t kSplitDepth = 1024, kSplitRows = 256, kMinGroup = 4, kMaxGroup = 24;
   static constexpr std::int64_t kMinSplitItems = 8;
@@ -55,10 +55,10 @@ class TileLoop {
   static constexpr std::int64_t kFarWeights = 16 << 20, kFarX = 640 << 10, kFarRows = 320;
 
   struct Scratch {
-    std::int64_t row, depth;  // the rows of x in the copy, and their first depth
+    std::int64_t row, depth;  // first row and first depth of the copied block of x
     alignas(64) X x[kFarX];
-    alignas(64) float row_of_x[kMaxDepth];  // a row as it is multiplied, if it is computed here
-    alignas(64) float sums[kMaxSums];       // sums of a panel and the one before, or of a group
+    alignas(64) float row_of_x[kMaxDepth];  // a row of x after its norm, or a window's elements
+    alignas(64) float sums[kMaxSums];       // sums of a panel and the previous one, or of a group of panels
     alignas(64) float gates[kMaxSums];
   };
 
@@ -112,7 +112,7 @@ class TileLoop {
         n_block_(ceil_div(job.n_row, block_rows_)),
         n_panel_(Stripes::n_panel(job)) {}
 
-  /// Fewer rows allow a greater depth.
+  /// Whether a block has the whole depth. Fewer rows allow a greater depth.
   static bool has_whole_depth(const LinearJob& job) {
     return job.d_in <= kMaxDepth || job.d_in <= kMaxX / round_up(job.n_row, kTileSide) / kTileSide * kTileSide;
   }
@@ -147,7 +147,7 @@ class TileLoop {
     finish_summed();
   }
 
-  /// Copies the block of x, unless an earlier item left it here.
+  /// Copies the block of x, unless the scratch memory has it from an earlier item.
   void take_rows() {
     if (row_ == scratch_->row && k_ == scratch_->depth) return;
     scratch_->row = row_, scratch_->depth = k_;
@@ -239,11 +239,11 @@ class TileLoop {
   const LinearJob& job_;
   Scratch* scratch_ = nullptr;
   const std::int64_t block_depth_, block_rows_, n_block_, n_panel_;
-  std::int64_t row_ = 0, n_row_ = 0, k_ = 0, depth_ = 0;  // rows of the current block
-  // Rows of this panel or the one before whose sums are complete, and how many of them are finished.
+  std::int64_t row_ = 0, n_row_ = 0, k_ = 0, depth_ = 0;  // rows and depth of the current block
+  // How many rows of this panel, or of the previous one, have complete sums, and how many of these are finished.
   Finish finish_;
   std::int64_t n_summed_ = 0, n_finished_ = 0;
-  std::int64_t n_finish_ = 0;  // at a time
+  std::int64_t n_finish_ = 0;  // rows that each call of Between finishes
 };
 
 }  // namespace vla::kernels

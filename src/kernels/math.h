@@ -22,7 +22,7 @@ VLA_INLINE typename V::Float exp_of_negative(typename V::Float x) {
   x = V::max(V::set(-88.0f), x);
   const Float shifted = V::fma(x, V::set(1.44269504f), V::set(kShift)), whole = shifted - kShift;
   const Float rest = V::fma(whole, V::set(0x1.05c61p-29f), V::fma(whole, V::set(-0x1.62e43p-1f), x));
-  // Minimax: relative error 2^-28 of the whole.
+  // Minimax: relative error 2^-28 of e^rest.
   Float p = V::fma(rest, V::set(1.3814540579915047e-3f), V::set(8.36874544620514e-3f));
   p = V::fma(p, rest, V::set(4.166838899254799e-2f));
   p = V::fma(p, rest, V::set(1.666652113199234e-1f));
@@ -31,7 +31,7 @@ VLA_INLINE typename V::Float exp_of_negative(typename V::Float x) {
   return (p + 1.0f) * power_of_two<V>(std::bit_cast<typename V::Int>(shifted) - std::bit_cast<std::int32_t>(kShift));
 }
 
-/// |x|, of any x.
+/// |x|; a NaN stays NaN.
 template <class V>
 VLA_INLINE typename V::Float size_of(typename V::Float x) {
   return std::bit_cast<typename V::Float>(std::bit_cast<typename V::Int>(x) & 0x7fffffff);
@@ -48,8 +48,8 @@ VLA_INLINE typename V::Float size_of(typename V::Float x) {
 namespace sigmoid {
 
 constexpr float kUnit = 0x1p-40f;
-/// Adding it to a small number rounds that to an integer n in the lowest bits, where n becomes the exponent of 2^n
-/// kUnit.
+/// Adding it to a small number rounds the number to an integer n and leaves the exponent of 2^n kUnit in the lowest
+/// bits.
 constexpr float kShift = 0x1.8p23f + 127 - 40;
 
 /// min(|x|, limit). NaN stays NaN.
@@ -75,7 +75,8 @@ VLA_INLINE typename V::Float multiply(typename V::Float x, typename V::Float y, 
                                       typename V::Float rest) {
   using Float = typename V::Float;
   const Float p = slope_of_power<V>(rest);
-  // From n = 24 on, 2^n + 1 rounds to 2^n. The missing one comes back through p, whose inverse is 1.2 to 1.7.
+  // From n = 24 on, 2^n + 1 rounds to 2^n. `lost` adds the missing 1 through the product with p; 1.625 stands for
+  // 1 / p, which is 1.2 to 1.7.
   const Float power = std::bit_cast<Float>(std::bit_cast<typename V::Int>(shifted) << 23), sum = power + kUnit;
   const Float lost = V::fma(sum - power, V::set(-1.625f), V::set(1.625f * kUnit));
   const Float divisor = V::fma(p, V::fma(rest, power, lost), sum);

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-// Compiled with -ffp-contract=off, so every machine makes the same codes.
+// Compiled with -ffp-contract=off, so every machine computes the same codes.
 #include "kernels/quantize_weights.h"
 
 #include <algorithm>
@@ -17,7 +17,7 @@ constexpr float kRound = 0x1.8p23f;  // adding this constant leaves an integer i
 /// Widens a row and returns its largest magnitude; NaN or infinity if a value is not finite.
 template <DType kType>
 float widen(const std::byte* stored, std::int64_t n, float* row) {
-  std::int32_t max_abs = 0;  // without signs, floats order like integers, with NaN above all
+  std::int32_t max_abs = 0;  // bits of |x|, which have the order of the floats, with NaN above all
   for (std::int64_t k = 0; k < n; ++k) {
     row[k] = stored_number(kType, stored, k);
     max_abs = std::max(max_abs, std::bit_cast<std::int32_t>(row[k]) & 0x7fffffff);
@@ -31,7 +31,7 @@ float widen(DType type, const std::byte* stored, std::int64_t n, float* row) {
                               : widen<DType::bf16>(stored, n, row);
 }
 
-/// The codes of a block for a step, and the sum of squared errors.
+/// Computes the codes of a block for a step. Returns the sum of squared errors.
 float try_step(const float* x, float step, float* codes) {
   constexpr int kLanes = 8;  // partial sums; their order is part of the result
   constexpr auto kMost = static_cast<float>(Int4Block::kMost);
@@ -49,9 +49,9 @@ float try_step(const float* x, float step, float* codes) {
   return sum;
 }
 
-/// The step, a multiple of `unit`, with the least squared error, and its codes. Candidates are the step that the
-/// block's largest value needs and smaller ones, which clip that value and are finer for the others. 0 for a block of
-/// zeros.
+/// Returns the step, in units of `unit`, with the least squared error, and writes its codes; 0 for a block of zeros.
+/// Candidates are the step that the block's largest value needs, and smaller ones, which clip the largest value but
+/// round the other values more finely.
 int best_step(const float* x, float unit, float* best_codes) {
   constexpr int kMaxStep = Int4Block::kMaxStep;
   float max_abs = 0, codes[Int4Block::kElements];
@@ -90,15 +90,15 @@ float fitted_scale(const float* row, const Int4Block* blocks, std::int64_t n, fl
   return square > 0 ? static_cast<float>(product / square) : otherwise;
 }
 
-/// A row of floats, to be rounded.
+/// What widen_row finds out about a row.
 struct WideRow {
-  float unit;  // of codes: the largest magnitude over its code; 0 for a row of zeros
+  float unit;  // value of code 1: the largest magnitude divided by its code; 0 for a row of zeros
   bool is_finite;
 };
 
 constexpr float kInt8Codes = 127, kInt4Codes = Int4Block::kMost * Int4Block::kMaxStep;
 
-/// Widens a row; a row that is not finite, or nearly zero, becomes zeros. n_code: of the largest magnitude.
+/// Widens a row; a row that is not finite, or nearly zero, becomes zeros. n_code: the code of the largest magnitude.
 WideRow widen_row(DType type, const std::byte* stored, std::int64_t d_in, float n_code, float* row) {
   const float max_abs = widen(type, stored, d_in, row);
   const bool is_finite = max_abs <= std::numeric_limits<float>::max();
@@ -119,15 +119,15 @@ std::vector<float> widen_rows(DType type, const std::byte* stored, std::int64_t 
   return units;
 }
 
-/// Rounds some rows of a stretch of columns, where later columns compensate the errors of earlier ones.
+/// Rounds some rows of a stretch of columns; later columns compensate the errors of earlier ones.
 class Stretch {
  public:
-  /// rows: the first row's element of the first column; units: of each row, a code's in int8, a step's in int4;
-  /// feedback: [n, n].
+  /// rows: address of the first row's element in the first column. units: for each row, the value of code 1 (int8) or
+  /// of step 1 (int4). feedback: [n, n].
   Stretch(const float* rows, std::int64_t d_in, std::span<const float> units, const float* feedback, std::int64_t n)
       : rows_(rows), d_in_(d_in), units_(units), feedback_(feedback), n_(n), asked_(units.size() * size(n)) {}
 
-  /// Makes int8 codes of each row. codes: the first row's code of the first column.
+  /// Computes the int8 codes of every row. codes: address of the first row's code in the first column.
   void round(std::byte* codes) {
     for (std::size_t k = 0; k < size(n_); ++k)
       for (std::size_t r = 0; r < units_.size(); ++r)
@@ -135,7 +135,7 @@ class Stretch {
             static_cast<std::byte>(static_cast<int>(round(r, k, units_[r], 127)));
   }
 
-  /// Makes the blocks of each row that start at column `begin`. blocks: those of the first row.
+  /// Computes the block of every row that starts at column `begin`. blocks: address of the first row's block.
   void round(std::int64_t begin, Int4Block* blocks) {
     const std::size_t first = size(begin);
     std::vector<int> steps;
@@ -176,7 +176,7 @@ class Stretch {
   std::span<const float> units_;
   const float* feedback_;
   std::int64_t n_;
-  std::vector<float> asked_;  // for every row, the sum of what was added to its columns
+  std::vector<float> asked_;  // compensation so far for each element: n columns per row
 };
 
 }  // namespace

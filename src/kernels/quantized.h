@@ -24,13 +24,13 @@ constexpr VLA_INLINE std::int64_t quantized_depth(std::int64_t d_in) { return ro
 /// Bytes from one row to the next.
 constexpr VLA_INLINE std::int64_t quantized_stride(std::int64_t d_in) { return quantized_depth(d_in) + kQuantizedUnit; }
 
-/// Bytes of n_row rows, and of what may be read after them.
+/// Bytes of n_row rows, including those that a tile may read after the last row.
 constexpr VLA_INLINE std::int64_t quantized_size(std::int64_t n_row, std::int64_t d_in) {
   return (n_row + kMaxTernaryRows - 1) * quantized_stride(d_in);
 }
 
-/// x is code / s. `sum` is the sum of the codes: weights have an offset (int8_panels.h), which adds its multiple of
-/// `sum` to each product.
+/// x is code / s. `sum` is the sum of the codes: the offset of weights (int8_panels.h) adds offset * sum to each
+/// product.
 struct RowScale {
   float s;
   std::int32_t sum;
@@ -50,7 +50,7 @@ template <class V>
 VLA_INLINE void quantize_row(const float* x, std::int64_t n, std::byte* to) {
   using Float = typename V::Float;
   using Int = typename V::Int;
-  // Without their signs, floats order like integers, with NaN above all.
+  // The bits of |x| have the order of the floats, with NaN above all.
   Int most = {};
   for (std::int64_t i = 0; i < n; i += V::width) {
     const Int size = std::bit_cast<Int>(load<V>(x + i, n - i)) & 0x7fffffff;

@@ -7,8 +7,8 @@
 /// Layouts of activations between two products that would both round them to bf16.
 namespace vla::kernels {
 
-/// rows: contiguous rows. tiles: squares of 32 rows by 32 elements, consecutive for the same rows, as AMX tile
-/// registers load them. Rows after the last may hold anything; elements after the last of a row are zeros.
+/// rows: contiguous rows. tiles: squares of 32 rows by 32 elements, as AMX tile registers load them; the squares of the
+/// same rows are consecutive. Rows after the last may hold anything; elements after the last of a row are zeros.
 enum class RoundedLayout { none, rows, tiles };
 
 constexpr std::int64_t kTileSide = 32;

@@ -57,7 +57,7 @@ VLA_INLINE void store(float* p, typename V::Float x, std::int64_t left) {
   left >= V::width ? V::store(p, x) : V::store_part(p, x, static_cast<int>(left));
 }
 
-/// Transposes W vectors of W lanes: each round interleaves vectors half of the square apart.
+/// Transposes W vectors of W lanes: each round interleaves vectors that are W / 2 apart.
 template <class V>
 VLA_INLINE void transpose(typename V::Float (&x)[V::width]) {
   constexpr int kHalf = V::width / 2;
@@ -74,7 +74,7 @@ VLA_INLINE void transpose(typename V::Float (&x)[V::width]) {
   }
 }
 
-/// Reduces each x[i] to lane i by `join` (a sum, a maximum). The order of elements is its own.
+/// Reduces each x[i] to lane i of the result by `join` (a sum or a maximum). The order of the elements is unspecified.
 template <class V, class Join>
 VLA_INLINE typename V::Float across(typename V::Float (&x)[V::width], Join join) {
 #pragma GCC unroll 4

@@ -74,7 +74,7 @@ struct Window {
         visit(images + ((corner.image * height + corner.y + row) * width + corner.x + column) * d, row * size + column);
   }
 
-  /// Elements `from` to `until` of a window row.
+  /// Copies elements `from` to `until` of a window row.
   VLA_INLINE void copy_line(const float* images, const Corner& corner, std::int64_t row, std::int64_t from,
                             std::int64_t until, float* to) const {
     const std::int64_t y = corner.y + row;

@@ -22,8 +22,8 @@ struct Arithmetic {
   /// the processor cannot run.
   static Result<Arithmetic> on_cpu(const std::string& kernels, Features machine);
   /// Parses `--kernels` for another device. CUDA runs our own kernels on matrices as stored (empty) or converted
-  /// ("float32", "bf16", "int8"); "ggml" selects ggml's backend in float32. Vulkan has only ggml's: "float32", "ggml",
-  /// "bf16" or empty. Errors: usage.
+  /// ("float32", "bf16", "int8", "int4"); "ggml" selects ggml's backend in float32. Vulkan has only ggml's backend:
+  /// "float32", "ggml", "bf16" or empty. Errors: usage.
   static Result<Arithmetic> on_device(const std::string& kernels, const std::string& device);
 };
 

@@ -20,7 +20,7 @@ class Fuser {
       if (l.needed[at(&node)] && !l.fused[at(&node)]) visit(node);
     join_products();
     fuse_readings();
-    // A norm or a window that its readers compute makes no operation of its own.
+    // A norm or a window that its readers compute needs no operation of its own.
     std::erase_if(ops_, [&](const FusedOp& op) {
       const auto* row = std::get_if<RowOp>(&op.op);
       const auto* window = std::get_if<WindowOp>(&op.op);
@@ -126,7 +126,7 @@ class Fuser {
     const Node* self = activate != nullptr ? activate : &linear;
     const Node* other = product->in[product->in[0].node() == self ? 1 : 0].node();
     const Node *gate = &linear, *up = other;
-    if (activate == nullptr) {  // then the other factor must be the activated one
+    if (activate == nullptr) {  // the other factor must be the activated one
       if (other->as<op::Activate>() == nullptr || only_reader(*other) != product) return nullptr;
       activate = other, gate = other->in[0].node(), up = &linear;
       if (gate->as<op::Linear>() == nullptr || only_reader(*gate) != activate) return nullptr;
@@ -157,8 +157,8 @@ class Fuser {
     return result;
   }
 
-  /// Marks the norm and rotation that attention applies as fused; their operations were made before and are dropped
-  /// at the end.
+  /// Marks the norm and rotation that attention applies as fused; their own operations exist already and are removed at
+  /// the end.
   void drop(const HeadRows& rows) {
     for (const Node* node : {rows.norm, rows.rope})
       if (node != nullptr) l.fused[at(node)] = true;
@@ -202,7 +202,7 @@ class Fuser {
     add(std::move(op), node);
   }
 
-  /// Joins products of one x into one operation, which reads x once, if nothing is fused behind them.
+  /// Joins products of one x into one operation, which reads x once, if nothing is fused after them.
   void join_products() {
     std::map<std::pair<ValueId, const void*>, FusedOp*> open;
     for (FusedOp& op : ops_) {
@@ -223,8 +223,8 @@ class Fuser {
     std::erase_if(ops_, [](const FusedOp& op) { return op.writes.empty(); });
   }
 
-  /// Fuses a norm or a window into the products that read it, if nothing else does: they compute it as they copy x, row
-  /// by row or place by place.
+  /// Fuses a norm or a window into the products that read it, if nothing else reads it. The products compute it as they
+  /// copy x, row by row or place by place.
   void fuse_readings() {
     for (FusedOp& op : ops_) {
       auto* linear = std::get_if<LinearOp>(&op.op);

@@ -21,8 +21,8 @@ class Layouts {
   void meet(Step& step, const Operands& operands);
   /// Adds a value that the target makes. `row`: elements from one row to the next.
   ValueId add_value(Shape shape, DType type, std::int64_t row);
-  /// Makes a product read x, or its norm, in another type. The first product that asks adds the conversion; later ones
-  /// share it.
+  /// Makes a product read x, or its norm, in another type. The first such product adds the conversion; later ones share
+  /// it.
   void round(const Step& step, LinearOp& op, DType type, std::int64_t row, const char* verb);
 
   /// Adds an operation before the current one.

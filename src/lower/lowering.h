@@ -10,7 +10,7 @@
 #include "graph/work.h"
 #include "lower/target.h"
 
-/// Turns a graph into a program for a machine. This file and those beside it hold for every machine: they ask a Target
+/// Turns a graph into a program for a machine. The files of lower/ itself are machine-independent: they ask a Target
 /// for its abilities and know neither kernels nor addresses. A target's own passes run between `store` and `schedule`;
 /// those of the CPU are in lower/cpu.
 namespace vla::lower {
@@ -35,7 +35,7 @@ struct Value {
   int layout = 0;
   const char* form = "";  // the layout's name in a printed program
 
-  // Meaningful for a base only.
+  // Valid for bases only.
   Placement placement = Placement::arena;
   std::size_t size = 0, begin = 0;  // bytes; begin: offset in the arena or in the program's own memory
   const Slot* slot = nullptr;
@@ -49,10 +49,10 @@ struct Operand {
 };
 using Operands = std::vector<Operand>;
 
-/// An operation as the passes after fusion see it.
+/// The part of an operation that the passes after fusion use.
 struct Step {
   std::vector<ValueId> reads, writes;  // reads: the operands without kNone, in order
-  std::vector<const Param*> matrices;  // that it multiplies by
+  std::vector<const Param*> matrices;  // matrices that it multiplies by
   int order = 0;                       // the id of the node whose result it computes
   bool invariant = false;              // its result is the same in every run
   int phase = 0;
@@ -63,10 +63,10 @@ struct Lowering {
   const Target& target;
 
   std::vector<Value> values = {};
-  std::vector<std::vector<const Node*>> readers = {};  // of each needed node
+  std::vector<std::vector<const Node*>> readers = {};  // readers of each needed node
   std::vector<bool> needed = {};                       // Graph::needed
   std::vector<bool> fused = {};                        // nodes that another node's operation computes
-  int n_prepare = 0, n_phase = 0;                      // phases of Program::prepare, and of prepare and run
+  int n_prepare = 0, n_phase = 0;                      // phases of Program::prepare; of prepare and run together
   std::size_t arena_size = 0, kept_size = 0;           // kept: results of prepare, and constants
 
   const Node* node(ValueId id) const { return values[static_cast<std::size_t>(id)].node; }
@@ -84,7 +84,7 @@ struct Lowering {
 std::size_t stage_of(const Lowering& l, const Step& step);
 /// Strides of contiguous elements.
 Shape contiguous_strides(const Shape& shape);
-/// Of each of the result's dimensions: its size or stride in x.
+/// The sizes or strides of x, in the order of the result's dimensions.
 Shape permuted(const Shape& of_x, const op::Permute& permute);
 bool is_contiguous(const Shape& shape, const Shape& stride);
 inline bool is_contiguous(const Value& value) { return is_contiguous(value.shape, value.stride); }
@@ -103,10 +103,10 @@ void start(Lowering& l);
 void schedule(Lowering& l, std::vector<Step*> steps);
 /// Sets Value::begin: places of values in the arena or in the program's own memory.
 void place(Lowering& l, const std::vector<Step*>& steps);
-/// Cuts phases until each reads groups of streamed matrices that stand in the windows together. An operation reads one
-/// group at most (`share_group`). Values keep their places: none lives longer than before beside another one.
+/// Splits phases until the groups of streamed matrices that each phase reads fit into the windows together. An
+/// operation reads at most one group (`share_group`). Values keep their places: disjoint lifetimes stay disjoint.
 void split(Lowering& l, const std::vector<Step*>& steps);
-/// Whether one operation may read all of these matrices: those of them that are streamed are in the same group.
+/// Whether one operation may read all of these matrices: the streamed ones must be in the same group.
 bool share_group(const Lowering& l, const std::vector<const Param*>& matrices);
 /// Schedules, places and splits a target's operations, and sorts them by phase.
 template <class TargetOp>

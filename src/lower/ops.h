@@ -51,7 +51,7 @@ struct FusedOp : Step {
 /// the product before; products of one x; gate and up; norm and rope into attention. A tapped node is computed on its
 /// own.
 std::vector<FusedOp> fuse(Lowering& l);
-/// Has results written straight to their slots, or copies them there.
+/// Lets operations write results straight to their slots if that is safe, else adds copies.
 void store(Lowering& l, std::vector<FusedOp>& ops);
 
 }  // namespace vla::lower

@@ -26,13 +26,13 @@ void find_invariants(const Lowering& l, const std::vector<Step*>& steps) {
   }
 }
 
-/// The last phases that read a slot, and that write it.
+/// The last phase that reads a slot, and the last that writes it; -1: none.
 struct SlotUse {
   int read = -1, written = -1;
 };
 
-/// Gives each step the first phase after its operands are made, and after earlier accesses to the slots that it reads
-/// or writes. Stages follow each other.
+/// Gives each step the first phase after those that compute its operands, and after conflicting accesses to the slots
+/// that it reads or writes. Stages follow each other.
 int schedule_part(Lowering& l, const std::vector<Step*>& steps, bool invariant, int first) {
   std::map<const Slot*, SlotUse> slots;
   const auto use_of = [&](ValueId id) -> SlotUse* {

@@ -16,7 +16,8 @@ int group_of(const Lowering& l, const Step& step) {
   return group;
 }
 
-/// Numbers the parts of a phase from `part` on: in each are groups of which the windows hold the first and the last.
+/// Assigns each group that a phase reads to a part, numbered from `part` on. All groups of a part fit into the windows
+/// together.
 std::map<int, int> parts_of(const std::set<int>& groups, int part) {
   std::map<int, int> parts;
   int first = groups.empty() ? 0 : *groups.begin();
@@ -37,11 +38,11 @@ bool share_group(const Lowering& l, const std::vector<const Param*>& matrices) {
 }
 
 void split(Lowering& l, const std::vector<Step*>& steps) {
-  std::vector<std::set<int>> groups(static_cast<std::size_t>(l.n_phase));  // that each phase reads
+  std::vector<std::set<int>> groups(static_cast<std::size_t>(l.n_phase));  // groups that each phase reads
   for (const Step* step : steps)
     if (const int group = group_of(l, *step); group >= 0) groups[static_cast<std::size_t>(step->phase)].insert(group);
-  std::vector<std::map<int, int>> parts;  // of each phase, the part for each group
-  std::vector<int> first;                 // and its first part
+  std::vector<std::map<int, int>> parts;  // for each phase, the part of each group
+  std::vector<int> first;                 // for each phase, its first part
   int next = 0;
   for (const std::set<int>& of_phase : groups) {
     first.push_back(next);

@@ -60,7 +60,7 @@ namespace {
 /// Returns the strides of a reshaped view if no copy is needed: each new dimension must be cut from old dimensions that
 /// are contiguous with each other.
 std::optional<Shape> reshape_strides(const Value& value, const Shape& to) {
-  std::vector<std::int64_t> sizes, strides;  // of the old shape, with contiguous dimensions joined
+  std::vector<std::int64_t> sizes, strides;  // the old shape, with contiguous dimensions joined
   for (std::size_t i = 0; i < 4; ++i) {
     if (value.shape[i] == 1) continue;
     if (!sizes.empty() && value.stride[i] == strides.back() * sizes.back())
@@ -70,7 +70,7 @@ std::optional<Shape> reshape_strides(const Value& value, const Shape& to) {
   }
   Shape result = contiguous_strides(to);
   std::size_t at = 0;
-  std::int64_t taken = 1;  // of the current old dimension
+  std::int64_t taken = 1;  // elements used of the current old dimension
   for (std::size_t i = 0; i < 4; ++i) {
     if (to[i] == 1) continue;
     if (at == sizes.size() || sizes[at] % (taken * to[i]) != 0) return {};

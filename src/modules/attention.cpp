@@ -41,7 +41,7 @@ std::optional<RmsNorm> head_norm(const Scope& s, const Heads& heads) {
   return heads.norm_eps ? std::optional(RmsNorm(s, heads.d_head, *heads.norm_eps)) : std::nullopt;
 }
 
-/// [n_head * d_head, n, ...] -> [d_head, n_head, n, ...], normalized and rotated if asked.
+/// [n_head * d_head, n, ...] -> [d_head, n_head, n, ...], normalized if `norm` is set and rotated if `rotary` is.
 Tensor head_rows(Graph& g, Tensor x, int n_head, const std::optional<RmsNorm>& norm, Tensor rotary) {
   x = split_heads(g, x, n_head);
   if (norm) x = (*norm)(g, x);

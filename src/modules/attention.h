@@ -43,7 +43,7 @@ struct Heads {
   Tensor rotary(Graph& g, int first, int count) const;
 };
 
-/// Keys and values in the cache, as `<path>.k` and `<path>.v`.
+/// Write keys and values to the cache as `<path>.k` and `<path>.v`, and read them.
 void put(Graph& g, Cache& cache, const std::string& path, const KeyValue& kv);
 KeyValue get(Graph& g, const Cache& cache, const std::string& path);
 
@@ -55,7 +55,7 @@ class KeyValueProjection {
   KeyValue operator()(Graph& g, Tensor context, Tensor rotary = {}) const {
     return (*this)(g, context, context, rotary);
   }
-  /// The same of two contexts.
+  /// The same with separate contexts for keys and values.
   KeyValue operator()(Graph& g, Tensor key_context, Tensor value_context, Tensor rotary) const;
 
  private:
@@ -64,9 +64,9 @@ class KeyValueProjection {
   std::optional<RmsNorm> norm_;
 };
 
-/// Attention of tokens [d_model, n, ...] to a context [d_context, n_key, ...] or to themselves. Projections `attn_q`,
-/// `attn_k`, `attn_v`; the concatenated heads (`attn_heads`) pass `attn_out`. `attn_q_norm`, `attn_k_norm` and
-/// `attn_sub_norm` exist if the heads ask for those norms.
+/// Attention of tokens [d_model, n, ...] to a context [d_context, n_key, ...] or to themselves, with the projections
+/// `attn_q`, `attn_k` and `attn_v`; `attn_out` projects the concatenated heads (tap `attn_heads`). `attn_q_norm`,
+/// `attn_k_norm` and `attn_sub_norm` exist if `heads` enables these norms.
 class Attention {
  public:
   Attention(const Scope& s, int d_model, int d_context, const Heads& heads);
@@ -74,7 +74,7 @@ class Attention {
   const KeyValueProjection& project() const { return kv_; }
   /// Attention of x to these segments: the shape of x. `rotary` [d_head, n] rotates queries; mask [n_key, n] or none.
   Tensor operator()(Graph& g, Tensor x, Tensor rotary, const std::vector<KeyValue>& segments, Tensor mask = {}) const;
-  /// Self-attention without a mask.
+  /// Self-attention; mask [n, n] or none.
   Tensor among(Graph& g, Tensor x, Tensor rotary, Tensor mask = {}) const {
     return (*this)(g, x, rotary, {kv_(g, x, rotary)}, mask);
   }

@@ -16,7 +16,7 @@ class BiAttention {
  public:
   struct Family {
     int d_model, d_inner, n_head;  // d_inner: width of all heads together
-    bool keeps_input;              // the residual is the layer's input, else the norm of it
+    bool keeps_input;              // the residual is the layer's input, else the normalized input
     float norm_eps;
 
     /// Reads n_head, d_inner and residual of `s`.
@@ -32,7 +32,7 @@ class BiAttention {
   /// One stream's part.
   struct Side {
     Side(const Scope& s, const Family& family);
-    /// Two projections of the stream's norm. The keys are its queries too.
+    /// Projects the normalized stream to keys and values. The keys serve as its queries, too.
     KeyValue project(Graph& g, Tensor normed, int n_head) const;
     /// Adds the attention output, [d_head, n_head, n], to x.
     Tensor add_to(Graph& g, Tensor x, Tensor attended) const;

@@ -71,9 +71,9 @@ class DetrEncoderLayer : public Module<DetrEncoderLayer> {
 class DetrDecoderLayer : public Module<DetrDecoderLayer> {
  public:
   DetrDecoderLayer(const Scope& s, const DetrFamily& family);
-  /// Keys and values of the encoder's tokens, at these positions, both [d_model, n].
+  /// Keys and values of the encoder's tokens: tokens, position [d_model, n].
   KeyValue project(Graph& g, Tensor tokens, Tensor position) const;
-  /// Its first part, self-attention of the queries: x, position [d_model, n_query] -> [d_model, n_query].
+  /// The first part of the layer, self-attention of the queries: x, position [d_model, n_query] -> [d_model, n_query].
   Tensor among(Graph& g, Tensor x, Tensor position) const { return among_(g, x, position); }
   /// The rest of the layer, for the x that `among` returned.
   Tensor forward(Graph& g, Tensor x, Tensor position, const KeyValue& seen) const;
@@ -86,7 +86,7 @@ class DetrDecoderLayer : public Module<DetrDecoderLayer> {
   Mlp mlp_;
 };
 
-/// Decoder layers over queries that no observation changes, each part at its own rate.
+/// Decoder layers over queries that do not depend on the observation. Each part is computed at its own rate.
 class DetrDecoder {
  public:
   DetrDecoder() = default;

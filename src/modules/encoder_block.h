@@ -9,9 +9,9 @@
 
 namespace vla {
 
-/// What differs between families of encoders.
+/// The options in which encoder families differ.
 struct EncoderFamily {
-  Activation activation;  // of the MLP
+  Activation activation;  // activation of the MLP
   bool scaled;            // attention and MLP are scaled feature by feature before they are added (LayerScale)
   Rule rule = Rule::floats;
   bool plain_keys = false;  // keys have no bias
@@ -41,11 +41,11 @@ class Film {
 /// SiglipEncoderLayer (ternary weights).
 class EncoderBlock : public Module<EncoderBlock> {
  public:
-  /// `d_condition`: width of the condition of FiLM between attention and MLP, 0 without FiLM.
+  /// `d_condition`: width of the FiLM condition, 0 without FiLM. FiLM acts between attention and MLP.
   EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps, EncoderFamily family = kPlainEncoder,
                int d_condition = 0);
-  /// x [d_model, n, n_view] -> the same shape; `rotary` [d_head, n] rotates queries and keys, or none; condition
-  /// [d_condition, 1] of FiLM.
+  /// x [d_model, n, n_view] -> the same shape; `rotary` [d_head, n] rotates queries and keys, or none; `condition`
+  /// [d_condition, 1] of FiLM, or none.
   Tensor forward(Graph& g, Tensor x, Tensor rotary = {}, Tensor condition = {}) const;
 
  private:

@@ -11,7 +11,7 @@ struct Streams {
   Tensor image, text;
 };
 
-/// A layer in which each stream attends to the other's input of the layer, then passes an MLP. Source:
+/// A layer in which each stream attends to the layer's input of the other stream and then passes an MLP. Source:
 /// lerobot_policy_turbovla vl_interaction.py TurboVLAFusionLayer.
 class FusionLayer {
  public:
@@ -24,7 +24,7 @@ class FusionLayer {
    public:
     Side(const Scope& s, const DetrFamily& family);
     Tensor norm(Graph& g, Tensor x) const { return attn_norm_(g, x); }
-    /// x and both streams after their norms.
+    /// `x`: this stream; `normed`, `other`: this and the other stream after their norms.
     Tensor forward(Graph& g, Tensor x, Tensor normed, Tensor other) const;
 
    private:

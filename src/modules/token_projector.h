@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// Numbers become tokens of a language model, by two layers: `<name>_in` and `<name>_out`. Source: openvla-oft
+/// Projects numbers to tokens of a language model, by two layers: `<name>_in` and `<name>_out`. Source: openvla-oft
 /// prismatic/models/projectors.py (ProprioProjector, NoisyActionProjector).
 class TokenProjector {
  public:

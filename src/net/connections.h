@@ -17,7 +17,7 @@ namespace vla::net {
 
 struct ConnectionLimits {
   std::size_t message = 0;      // bytes in one request
-  std::size_t connections = 0;  // at once
+  std::size_t connections = 0;  // open at once
   std::size_t receipt = 0;      // bytes in all incomplete requests
 };
 
@@ -29,14 +29,14 @@ struct Connections {
   ConnectionLimits limits;
   std::map<std::uint64_t, std::shared_ptr<Connection>> connections = {};  // oldest first
   std::size_t n_held = 0;                                                 // bytes in incomplete requests
-  bool has_freed = false;  // since the last sweep: requests or answers of connections that have ended
+  bool has_freed = false;  // since the last sweep, ended connections freed requests or answers
 
-  /// Null if it has ended. The pointer keeps it alive while it is used.
+  /// Returns a connection; null if it has ended. The pointer keeps it alive while it is used.
   std::shared_ptr<Connection> find(std::uint64_t connection) const {
     const auto found = connections.find(connection);
     return found == connections.end() ? nullptr : found->second;
   }
-  /// Sends it an answer by `send`. If it has ended, the request is freed now.
+  /// Calls `send` with the connection. If it has ended, only notes that its request is freed.
   template <class Send>
   void answer(std::uint64_t connection, Send send) {
     if (const auto found = find(connection)) {

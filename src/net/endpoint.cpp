@@ -65,7 +65,7 @@ Status check_free(const std::string& endpoint, const std::string& option) {
   if (!S_ISSOCK(info.st_mode)) return Error{Code::io, endpoint, "a path of its own", "a file that is no socket"};
   sockaddr_un address = {};
   address.sun_family = AF_UNIX;
-  if (path.size() >= sizeof(address.sun_path)) return {};  // ZeroMQ's own word for a free port
+  if (path.size() >= sizeof(address.sun_path)) return {};  // too long: binding reports it
   std::memcpy(address.sun_path, path.c_str(), path.size());
   const int fd = ::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
   const bool served = fd >= 0 && ::connect(fd, reinterpret_cast<const sockaddr*>(&address), sizeof(address)) == 0;

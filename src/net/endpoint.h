@@ -19,8 +19,8 @@ enum class Reach {
 /// local counts as remote. Errors: usage.
 Result<Reach> reach_of(const std::string& endpoint);
 
-/// Removes a stale socket at an ipc path before binding. Refuses any other file, and a socket that is being served.
-/// `option`: the option that gave the endpoint. Errors: io.
+/// Checks before binding that no process serves an ipc path; a stale socket there is allowed. `option`: the option that
+/// gave the endpoint. Errors: io, for a socket that is being served and for any other file.
 Status check_free(const std::string& endpoint, const std::string& option);
 
 }  // namespace vla::net

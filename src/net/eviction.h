@@ -18,7 +18,7 @@ struct Standing {
   std::string group;              // `group_of` the peer
   bool is_open = false;           // its handshake is complete; with keys it is authenticated
   Clock::time_point served = {};  // time of its last request
-  Clock::time_point began = {};   // when the request began that it is sending
+  Clock::time_point began = {};   // start of the request that it is sending
   std::size_t n_held = 0;         // bytes of that request so far
 };
 /// Oldest connection first.
@@ -32,22 +32,22 @@ std::string group_of(const std::string& peer);
 /// The facts that decide whose turn it is in a queue.
 struct Share {
   std::string group;             // `group_of` the peer
-  Clock::time_point since = {};  // its connection
+  Clock::time_point since = {};  // when the peer connected
 };
 
 /// How many connections may be in the handshake at once.
 std::size_t max_handshakes(std::size_t max_connections);
 
-/// Chooses the connection that gives way to new ones; none while there is room. Half of the places are kept for the
-/// oldest connections that were served within the last minute. Handshakes give way first, except for an eighth of the
-/// places. Then the largest group of those that could gives way, where groups with at most a sixteenth of the places
-/// count as equal. Within it, connections that are not sending a request go first, the least recently served before
-/// others.
+/// Chooses the connection that gives way to new ones; none while places are free. Half of the places are kept for the
+/// oldest connections that were served within the last minute. Handshakes give way first if they hold more than an
+/// eighth of the places. Else the choice is a connection without a kept place, of the group with most such connections;
+/// groups with at most a sixteenth of the places count as equal. Within a group, connections that are not sending a
+/// request go first, and among them the least recently served.
 std::optional<std::uint64_t> to_evict(const Standings& standings, std::size_t max_connections, Clock::time_point now);
 
-/// Chooses the connection whose incomplete request gives way if all of them hold more than `max_bytes`; none otherwise.
-/// Connections with a kept place are last. Then the group with most bytes is chosen, where groups with at most one
-/// largest message count as equal, and in it the request that began first.
+/// Chooses the connection whose incomplete request gives way if incomplete requests hold more than `max_bytes`
+/// together; none otherwise. Connections with a kept place are last. Then the group with most bytes is chosen, where
+/// groups with at most one largest message count as equal, and in it the request that began first.
 std::optional<std::uint64_t> to_interrupt(const Standings& standings, std::size_t max_connections,
                                           std::size_t max_message, std::size_t max_bytes, Clock::time_point now);
 

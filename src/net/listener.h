@@ -31,7 +31,8 @@ class Listener {
     if (!is_waiting_ && !is_stopped_) accept();
   }
 
-  /// Takes no connection any more. Destroy it only when the loop waits no more, which has yet to call what waits here.
+  /// Stops accepting connections. Destroy the listener only after the loop's last `wait`: the loop may still call its
+  /// pending callbacks.
   void stop() {
     is_stopped_ = true;
     boost::system::error_code ignored;

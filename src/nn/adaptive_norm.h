@@ -26,12 +26,12 @@ class AdaRmsNorm : public Module<AdaRmsNorm> {
   Linear dense_;
 };
 
-/// LayerNorm without weights, whose scale and shift are linear in a condition by a matrix of the norm's own path.
-/// Sources: lerobot policies/groot/action_head/cross_attention_dit.py AdaLayerNorm (scale_shift), DiT.forward
+/// LayerNorm without affine weights. Its scale and shift are linear in a condition; their matrix has the norm's own
+/// path. Sources: lerobot policies/groot/action_head/cross_attention_dit.py AdaLayerNorm (scale_shift), DiT.forward
 /// (shift_scale).
 class AdaLayerNorm {
  public:
-  /// Which of the two are the first `d` rows of the matrix.
+  /// Whether scales or shifts are the first `d` rows of the matrix.
   enum class Order { scale_shift, shift_scale };
   AdaLayerNorm(const Scope& s, int d, float eps, Order order);
 

@@ -89,7 +89,7 @@ Tensor copies_mask(Graph& g, const std::vector<int>& copies, int n_query) {
 }
 
 Tensor tanh_of(Graph& g, Tensor x) {
-  constexpr int kHead = 8;  // features of a head; only the first is used: no device has smaller heads
+  constexpr int kHead = 8;  // features of a head, of which only the first is used
   const std::int64_t n = x.dim(0) * x.dim(1);
   const auto firsts = [&](const std::string& key, const std::vector<float>& numbers) {
     const Shape shape = {kHead, static_cast<std::int64_t>(numbers.size()), 1, 1};

@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// Keys and values of one stretch of tokens: [d_head, n_head_kv, n_key, n_batch] each.
+/// Keys and values of one segment of tokens: [d_head, n_head_kv, n_key, n_batch] each.
 struct KeyValue {
   Tensor key, value;
 };
@@ -31,14 +31,15 @@ Tensor apart_mask(Graph& g, std::span<const int> group_sizes);
 /// The mask of `n_query` tokens that see the first `n_seen` of `n_key`: [n_key, n_query].
 Tensor first_mask(Graph& g, int n_seen, int n_key, int n_query);
 
-/// The mask of `n_query` tokens that see `n_past` earlier tokens, themselves, and those before them: [n_past + n_query,
-/// n_query].
+/// The mask of `n_query` tokens, each of which sees `n_past` earlier tokens, the queries before it, and itself: [n_past
+/// + n_query, n_query].
 Tensor causal_mask(Graph& g, int n_past, int n_query);
 
-/// The same for tokens of which some are hidden from every token: [n, n]. The first must be visible.
+/// The causal mask of a sequence in which every token j with `seen[j]` false is hidden from all tokens: [n, n]. The
+/// first token must be visible.
 Tensor causal_mask(Graph& g, const std::vector<bool>& seen);
-/// The mask of keys that stand for `copies[j]` equal keys each: ln(copies[j]), since exp(score + ln n) is n times
-/// exp(score). [copies.size(), n_query], or none if all are 1.
+/// The mask in which key j stands for `copies[j]` equal keys: it adds ln(copies[j]), because exp(score + ln n) is n
+/// times exp(score). [copies.size(), n_query], or none if all are 1.
 Tensor copies_mask(Graph& g, const std::vector<int>& copies, int n_query);
 
 /// tanh of numbers within ±1e9, [d, n] -> the same shape. It is an attention over the values 1 and -1 with the scores x

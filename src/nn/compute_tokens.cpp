@@ -10,7 +10,7 @@
 namespace vla {
 namespace {
 
-/// Stands for "all of it is read" in place of the dimension of an operand's tokens.
+/// Replaces an operand's token dimension if the whole operand is read.
 constexpr int kWhole = -1;
 
 /// The dimension of the old shape that becomes dimension `dim` of the new one, or kWhole if that dimension is merged or
@@ -23,8 +23,8 @@ int dim_before_reshape(const Shape& from, const Shape& to, int dim) {
   return kWhole;
 }
 
-/// Which tokens an operation reads to compute some tokens of its result, where tokens are dimension `dim`: for each
-/// operand the dimension of its tokens, or kWhole. None for operations that mix tokens.
+/// For an operation that computes token i of its result (in dimension `dim`) from token i of its operands: the token
+/// dimension of each operand, or kWhole for an operand that is read completely. None for operations that mix tokens.
 std::optional<std::vector<int>> operands_of_tokens(const Node& node, int dim) {
   std::vector<int> dims(node.in.size(), kWhole);
   const bool is_sum = node.as<op::Add>() != nullptr || node.as<op::Multiply>() != nullptr;
@@ -60,14 +60,14 @@ class Narrowing {
   void find_whole(Tensor y) {
     const auto& nodes = g_.nodes();
     whole_.assign(nodes.size(), false);
-    std::vector<int> dim(nodes.size(), kWhole);  // nodes of which only some tokens are read
+    std::vector<int> dim(nodes.size(), kWhole);  // token dimension, where an operation reads only some tokens
     dim[at(y)] = 1;
     for (auto node = nodes.rbegin(); node != nodes.rend(); ++node) {
       const auto id = static_cast<std::size_t>(node->id);
       std::optional<std::vector<int>> dims;
       if (dim[id] != kWhole && !whole_[id]) dims = operands_of_tokens(*node, dim[id]);
       whole_[id] = whole_[id] || node->tapped || node->as<op::Write>() != nullptr || (dim[id] != kWhole && !dims);
-      if (!whole_[id] && !dims) continue;  // nobody reads it
+      if (!whole_[id] && !dims) continue;  // no operation needs it
       for (std::size_t i = 0; i < node->in.size(); ++i) {
         const std::size_t in = at(node->in[i]);
         const int wanted = whole_[id] ? kWhole : (*dims)[i];

@@ -22,14 +22,15 @@ Tensor Convolution::forward(Graph& g, Tensor x) const {
 
 namespace {
 
-/// `count` zeros before and behind the tokens.
+/// Adds `count` zero tokens before and after x.
 Tensor padded(Graph& g, Tensor x, int count) {
   if (count == 0) return x;
   const Tensor zeros = full(g, 0, x.dim(0), count);
   return concat_tokens(g, {zeros, x, zeros});
 }
 
-/// What a window of `size` tokens sees at each of its places: [d, n] -> [size * d, n - size + 1].
+/// Concatenates the tokens in a window of `size` tokens, for each place of the window: [d, n] -> [size * d, n - size +
+/// 1].
 Tensor windows(Graph& g, Tensor x, int size) {
   const int n_place = static_cast<int>(x.dim(1)) - size + 1;
   std::vector<Tensor> parts;
@@ -43,7 +44,7 @@ Tensor TokenConvolution::forward(Graph& g, Tensor x) const {
   return product_.forward(g, windows(g, padded(g, x, size_ / 2), size_));
 }
 
-/// Of padded tokens p a place sees p_2i, p_2i+1 and p_2i+2: a pair, and the first of the next pair.
+/// Place i of the window covers the padded tokens p_2i, p_2i+1 and p_2i+2: a pair, and the first of the next pair.
 Tensor HalvingConvolution::forward(Graph& g, Tensor x) const {
   const std::int64_t d = x.dim(0);
   const int n = static_cast<int>(x.dim(1)) / 2;

@@ -22,8 +22,8 @@ class Convolution : public Module<Convolution> {
   Linear product_;
 };
 
-/// A convolution over tokens in their order with bias: x [d_in, n] -> [d_out, n], with size / 2 zeros of padding on
-/// each side. Matrix columns are ordered by place in the window, then by feature. Source: torch.nn.Conv1d(padding =
+/// A 1-D convolution with bias over the sequence of tokens: x [d_in, n] -> [d_out, n], with size / 2 zeros of padding
+/// on each side. Matrix columns are ordered by place in the window, then by feature. Source: torch.nn.Conv1d(padding =
 /// kernel_size // 2).
 class TokenConvolution : public Module<TokenConvolution> {
  public:
@@ -37,8 +37,8 @@ class TokenConvolution : public Module<TokenConvolution> {
   Linear product_;
 };
 
-/// Halves an even number of tokens: x [d, n] -> [d, n / 2]. Matrix columns are ordered as those of TokenConvolution.
-/// Source: torch.nn.Conv1d(kernel_size = 3, stride = 2, padding = 1).
+/// Halves an even number of tokens: x [d, n] -> [d, n / 2]. Matrix columns are ordered as in TokenConvolution. Source:
+/// torch.nn.Conv1d(kernel_size = 3, stride = 2, padding = 1).
 class HalvingConvolution : public Module<HalvingConvolution> {
  public:
   HalvingConvolution(const Scope& s, int d) : Module(s), product_(s, 3 * d, d, Bias::yes) {}
@@ -48,9 +48,9 @@ class HalvingConvolution : public Module<HalvingConvolution> {
   Linear product_;
 };
 
-/// Doubles the number of tokens: x [d, n] -> [d, 2 n]. Tokens at even places are made of x_{i - 1} and x_i by the
-/// matrix `even`, those at odd places of x_i and x_{i + 1} by `odd`, whose columns are ordered so; beyond the ends are
-/// zeros. Source: torch.nn.ConvTranspose1d(kernel_size = 4, stride = 2, padding = 1).
+/// Doubles the number of tokens: x [d, n] -> [d, 2 n]. The matrix `even` maps (x_{i - 1}, x_i) to token 2 i, and `odd`
+/// maps (x_i, x_{i + 1}) to token 2 i + 1; their columns have this order. Tokens beyond the ends are zeros. Source:
+/// torch.nn.ConvTranspose1d(kernel_size = 4, stride = 2, padding = 1).
 class DoublingConvolution : public Module<DoublingConvolution> {
  public:
   DoublingConvolution(const Scope& s, int d)

@@ -25,10 +25,11 @@ class Embedding : public Module<Embedding> {
 };
 
 /// The pixels of non-overlapping patches, row by row: images [width, height, 3, n_view] -> [3 * patch_size^2, n_patch,
-/// n_view], of a patch channel, row, column.
+/// n_view]. A patch is ordered by channel, row, column.
 Tensor patches(Graph& g, Tensor images, int patch_size);
 
-/// Non-overlapping patches through one product, which equals a convolution with stride = patch.
+/// Projects non-overlapping patches with one product, which equals a convolution whose kernel size and stride are
+/// `patch_size`.
 /// images [width, height, 3, n_view] -> [d_model, n_patch, n_view], patches row by row.
 class PatchEmbed : public Module<PatchEmbed> {
  public:

@@ -13,7 +13,7 @@ GroupNorm::GroupNorm(const Scope& s, int d, int n_group, float eps)
             std::to_string(d) + " features in " + std::to_string(n_group) + " groups");
 }
 
-/// The numbers of a group become one row, which is normed and put back.
+/// Moves the values of a group into one row, normalizes the row, and moves the values back.
 Tensor GroupNorm::forward(Graph& g, Tensor x) const {
   const std::int64_t d = x.dim(0) / n_group_, n_place = x.dim(1) * x.dim(2), n_view = x.dim(3);
   const auto exchanged = [&](Tensor y, const Shape& shape) { return permute(g, reshape(g, y, shape), {0, 2, 1, 3}); };

@@ -6,8 +6,8 @@
 
 namespace vla {
 
-/// (x - mean) / sqrt(variance + eps) * weight + bias, where mean and variance are those of a group of features at all
-/// places of a view. x [d, width, height, n_view] -> the same shape. Source: torch.nn.GroupNorm.
+/// (x - mean) / sqrt(variance + eps) * weight + bias, with mean and variance over a group of features at all places of
+/// a view. x [d, width, height, n_view] -> the same shape. Source: torch.nn.GroupNorm.
 class GroupNorm : public Module<GroupNorm> {
  public:
   GroupNorm(const Scope& s, int d, int n_group, float eps);

@@ -29,8 +29,8 @@ class Mlp {
   Activation activation_;
 };
 
-/// down(activation(gate(x)) * up(x)), without biases, where `sub_norm_eps` is given with an RMS norm `ffn_sub_norm` in
-/// front of `down`. x [d_model, n] -> the same shape.
+/// down(activation(gate(x)) * up(x)), without biases. If `sub_norm_eps` is given, an RMS norm `ffn_sub_norm` precedes
+/// `down`. x [d_model, n] -> the same shape.
 /// Sources: transformers LlamaMLP (silu), GemmaMLP (gelu_tanh); BitVLA modeling_bitnet.py BitNetMLP (relu_squared).
 class GatedMlp {
  public:

@@ -10,11 +10,11 @@
 
 namespace vla {
 
-/// How a reference rounds the angles, in float32: a position divided by base^(2i/d), or multiplied with the rounded
-/// 1 / base^(2i/d). At position 800 the two are up to 6e-5 apart. Sources: lerobot
+/// How a reference rounds the angles in float32. quotient: position / base^(2i/d). product: position times the rounded
+/// 1 / base^(2i/d). At position 800 the two differ by up to 6e-5. Sources: lerobot
 /// policies/smolvla/smolvlm_with_expert.py apply_rope; transformers modeling_gemma.py GemmaRotaryEmbedding. bfloat16:
-/// the product of what is rounded to bfloat16, rounded to it again, and so are its cosine and sine. At position 500 an
-/// angle is up to 3 away from that of the others.
+/// like product, but position, 1 / base^(2i/d), their product, its cosine and its sine are each rounded to bfloat16. At
+/// position 500 an angle differs from the other rules by up to 3.
 enum class RotaryAngle { quotient, product, bfloat16 };
 
 /// Rotary embedding, half-split pairing: (x_i, x_{i + d/2}) are rotated by position / base^(2i/d). Token j of x has the
@@ -23,15 +23,16 @@ Tensor apply_rope(Graph& g, Tensor x, float base, RotaryAngle angle, int first);
 /// The same with the angles of a table [d_head, n_token] that every batch shares. x [d_head, n_head, n_token, n_batch].
 inline Tensor apply_rope(Graph& g, Tensor x, Tensor table) { return g.add(op::Rope{}, {x, table}); }
 
-/// VLA-Adapter's rotary embedding, whose pairs are neighbours but whose angles are a half-split one's, so that the two
-/// of a pair turn by different angles: number j of a head by position / base^(2 (j mod d/2) / d). The reference casts
-/// its head with the frequencies to bfloat16 and computes the table so, in training too. Token i has position i. x
-/// [d_head, n_head, n_token] -> the same shape, in each head the first of all pairs before the second, which products
-/// of queries and keys do not see. Source: VLA-Adapter prismatic/models/action_heads.py RotaryPositionEmbedding,
-/// apply_rope; experiments/robot/openvla_utils.py get_action_head.
+/// VLA-Adapter's rotary embedding. It pairs neighbours but takes the angles of half-split pairing, so the two elements
+/// of a pair turn by different angles: element j of a head by position / base^(2 (j mod d/2) / d). The reference casts
+/// its head, including the frequencies, to bfloat16 and computes the table in bfloat16, in training too. Token i has
+/// position i. x [d_head, n_head, n_token] -> the same shape. In each head of the result the first elements of all
+/// pairs precede the second elements; products of queries and keys do not depend on this order. Source: VLA-Adapter
+/// prismatic/models/action_heads.py RotaryPositionEmbedding, apply_rope; experiments/robot/openvla_utils.py
+/// get_action_head.
 Tensor apply_uneven_rope(Graph& g, Tensor x, float base);
 
-/// The table of tokens at these positions, one for each: [d_head, n_token], per token d/2 cosines, then d/2 sines.
+/// The rotary table of tokens at `positions`: [d_head, n_token], per token d/2 cosines, then d/2 sines.
 Tensor rotary_table(Graph& g, int d_head, float base, RotaryAngle angle, std::span<const int> positions);
 
 /// mRoPE position id of a token: time, row and column.
@@ -49,8 +50,8 @@ Tensor grid_rotary_table(Graph& g, int d_head, float base, const std::vector<Pos
 Tensor centre_rotary_table(Graph& g, int d_head, float base, int n_first, int n_row, int n_column);
 
 /// The mRoPE table of images within text: pair i is rotated by time, row or column / base^(2i/d). Rows take the
-/// `sections[1]` pairs 1, 4, 7, ..., columns the `sections[2]` pairs 2, 5, 8, ..., time all others. Source: the same
-/// file, Qwen3VLTextRotaryEmbedding.apply_interleaved_mrope.
+/// `sections[1]` pairs 1, 4, 7, ..., columns the `sections[2]` pairs 2, 5, 8, ..., time all others. Source:
+/// transformers modeling_qwen3_vl.py Qwen3VLTextRotaryEmbedding.apply_interleaved_mrope.
 Tensor mrope_table(Graph& g, int d_head, float base, const std::array<int, 3>& sections,
                    const std::vector<PositionId>& positions);
 

@@ -54,7 +54,8 @@ inline Tensor permute(Graph& g, Tensor x, const std::array<int, 4>& order) { ret
 inline Tensor reshape(Graph& g, Tensor x, const Shape& shape) { return g.add(op::Reshape{}, {x}, shape); }
 /// All tokens of all views as one sequence: [d, n, n_view] -> [d, n * n_view].
 Tensor flatten_views(Graph& g, Tensor x);
-/// Puts the same tokens before those of every view: tokens [d, n_first], x [d, n, n_view] -> [d, n_first + n, n_view].
+/// Prepends the same tokens to the tokens of every view: tokens [d, n_first], x [d, n, n_view] -> [d, n_first + n,
+/// n_view].
 Tensor prepend_tokens(Graph& g, Tensor tokens, Tensor x);
 /// Sets all features but the first `count` to zero: [d, n] -> the same shape.
 Tensor zero_features_after(Graph& g, Tensor x, int count);

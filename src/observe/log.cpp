@@ -112,7 +112,8 @@ void Log::event(Level level, const char* name, const Fields& fields) noexcept {
   }
 }
 
-/// The part of a note that is the same for each act: values that change come after a colon or a bracket.
+/// Whether a note is new, or was last logged long ago. Notes are compared up to the first colon or bracket, since
+/// changing values follow it.
 bool Log::is_news(const std::string& client, const std::string& note) {
   const Clock::time_point at = Clock::now();
   if (noted_.size() >= kMaxNoted) noted_.clear();
@@ -134,7 +135,7 @@ void Log::tell_notes(const Answered& answered) {
              {"request_id", request.request_id},
              {"note", note}});
     }
-  } catch (const std::exception&) {  // as above
+  } catch (const std::exception&) {  // no memory for a line: it is dropped
   }
 }
 
@@ -162,7 +163,7 @@ void Log::answered(const Answered& answered) {
       fields.emplace_back("hint", error->hint);
     }
     event(level, "request", fields);
-  } catch (const std::exception&) {  // as above
+  } catch (const std::exception&) {  // no memory for a line: it is dropped
   }
 }
 
@@ -177,7 +178,7 @@ void Log::dropped(const Dropped& connection) {
            {"name", connection.name},
            {"why", connection.why},
            {"detail", connection.detail}});
-  } catch (const std::exception&) {  // as above
+  } catch (const std::exception&) {  // no memory for a line: it is dropped
   }
 }
 

@@ -19,8 +19,8 @@ enum class LogFormat { text, json };
 /// text. Clients' values are escaped. docs/serving.md lists events and fields.
 class Log final : public Observer {
  public:
-  /// A field: a name of ours, and its value as ASCII JSON, so that a client's text cannot act on a terminal. It is
-  /// stored as text, because the JSON library allocates memory even to destroy its objects.
+  /// A field: a name that the server chooses, and its value as ASCII JSON, so that a client's text cannot act on a
+  /// terminal. It is stored as text, because the JSON library allocates memory even to destroy its objects.
   struct Field {
     template <class Value>
     Field(const char* its_name, const Value& value)
@@ -49,7 +49,7 @@ class Log final : public Observer {
   LogFormat format_;
   Level min_level_;
   Writer writer_;
-  std::atomic<std::uint64_t> n_told_ = 0;  // count of dropped lines
+  std::atomic<std::uint64_t> n_told_ = 0;  // dropped lines that are already reported
   // For the I/O thread: how many lines about clients may be written now, and how many were left out.
   double allowance_;
   std::uint64_t n_left_out_ = 0;

@@ -130,7 +130,7 @@ void Metrics::answered(const Answered& answered) try {
   observe("queue", seconds(answered.started - request.at));
   for (const auto& [stage, ms] : answered.stages) observe(stage, ms / 1e3);
   observe("total", seconds(answered.sent - request.at));
-} catch (const std::bad_alloc&) {  // as above
+} catch (const std::bad_alloc&) {  // not counted; the server continues
 }
 
 void Metrics::observe(const std::string& stage, double seconds) {

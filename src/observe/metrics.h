@@ -44,10 +44,10 @@ class Metrics final : public Observer {
   prometheus::Family<prometheus::Counter>& dropped_;
   Gauges &bundles_, &runtimes_, &memory_;
   prometheus::Counter &received_bytes_, &sent_bytes_, &clients_, &refused_, &beyond_, &rows_beyond_;
-  prometheus::Counter *chunks_noted_, *chunks_refused_;  // with rows outside of the limits
+  prometheus::Counter *chunks_noted_, *chunks_refused_;  // chunks with rows beyond the limits
   std::mutex mutex_;
-  std::multimap<std::string, std::pair<Gauges*, prometheus::Gauge*>> gauges_;  // by policy
-  // Of the I/O thread:
+  std::multimap<std::string, std::pair<Gauges*, prometheus::Gauge*>> gauges_;  // keyed by policy
+  // For the I/O thread only:
   std::map<std::string, prometheus::Histogram*> stage_;
   std::map<std::pair<Kind, int>, prometheus::Counter*> request_;
 };

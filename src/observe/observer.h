@@ -17,16 +17,16 @@ namespace vla::observe {
 using wire::Kind;
 using wire::kind_name;
 
-/// A request as the server knows it before it has looked into it.
+/// A request before its body is decoded.
 struct Received {
-  std::string client;            // the connection: a number that is never given again
-  std::string peer;              // who is there: the client's public key where there are keys, else its address
-  std::string name;              // as the client called itself in a hello on this connection
-  std::uint64_t request_id = 0;  // the client's number; 0 where it could not be read
+  std::string client;            // identifies the connection; never reused
+  std::string peer;              // the client's public key if there are keys, else its address
+  std::string name;              // the client's name from a hello on this connection
+  std::uint64_t request_id = 0;  // the client's number; 0 if it cannot be read
   Kind kind = Kind::unknown;
   std::size_t size = 0;  // bytes of the request
   Clock::time_point at;
-  bool is_first = false;  // of its connection
+  bool is_first = false;  // first request of its connection
 };
 
 /// A connection that the server ended.
@@ -41,21 +41,21 @@ struct Dropped {
 struct Answered {
   Received request;
   const Error* error = nullptr;         // null: answered as requested
-  Clock::time_point started, finished;  // of the engine; both `request.at` where the engine never saw the request
+  Clock::time_point started, finished;  // times in the engine; both `request.at` if it got no request
   Clock::time_point sent;               // handed to the socket
-  Timing stages;                        // of the engine, "decode" first; empty where it never saw the request
+  Timing stages;                        // the engine's, "decode" first; empty if the request never reached it
   std::size_t n_sent = 0;               // bytes of the answer
-  /// The serialized v1::Request and v1::Response, valid during the call only: those that went over the wire, or what an
-  /// act of another protocol would have been. Empty where it was refused in that protocol.
+  /// The serialized v1::Request and v1::Response, valid during the call only: those on the wire, or the equivalent of
+  /// an act in another protocol. Empty if an act in another protocol was refused.
   std::span<const std::byte> in, out;
   bool out_of_range = false;           // answered though the state is beyond the bundle's bound
-  int n_beyond = 0;                    // rows outside of --limits of a chunk that was answered or refused for them
-  std::span<const std::string> notes;  // of the chunk: warnings, valid during the call only
+  int n_beyond = 0;                    // rows beyond --limits, in an answered chunk or in one refused for them
+  std::span<const std::string> notes;  // the chunk's warnings, valid during the call only
   const char* code() const { return error == nullptr ? "ok" : code_name(error->code); }
 };
 
-/// Watches the server: metrics, logs, traces and recordings are observers. A call must return at once, since the thread
-/// that makes it has other clients to serve, and must not throw.
+/// Watches the server: metrics, logs, traces and recordings are observers. A call must not throw, and must return at
+/// once: its thread has other clients to serve.
 class Observer {
  public:
   virtual ~Observer() = default;
@@ -63,7 +63,7 @@ class Observer {
   virtual void dropped(const Dropped&) {}    // on the I/O thread
   virtual void started(const Received&) {}   // when an act leaves the queue, on the thread that prepares it
   virtual void answered(const Answered&) {}  // on the I/O thread
-  /// Whether `in` and `out` are wanted of acts of other protocols too, for which they are made.
+  /// Whether the observer needs `in` and `out` for acts of other protocols too. They must be encoded for that.
   virtual bool records() const { return false; }
 };
 

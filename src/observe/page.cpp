@@ -21,11 +21,11 @@ using Json = nlohmann::ordered_json;
 constexpr std::size_t kMaxAnswer = 40;  // acts in an answer
 constexpr std::size_t kMaxSeen = 8;     // pictures that are kept for a second viewer
 
-// What is told of an act: more than any policy has, and little enough that nobody waits for a hostile one.
+// Limits of what the page shows of an act: more than any policy has, and so little that a hostile act delays nobody.
 constexpr std::size_t kMaxText = 4096, kMaxName = 256;  // bytes
 constexpr std::size_t kMaxViews = 32, kMaxStates = 32, kMaxNotes = 32, kMaxStages = 64;
 constexpr std::size_t kMaxValues = 1024, kMaxActions = 8192;           // numbers
-constexpr std::size_t kMaxMessage = 64 << 10, kMaxResponse = 1 << 20;  // bytes of one that is parsed
+constexpr std::size_t kMaxMessage = 64 << 10, kMaxResponse = 1 << 20;  // maximum bytes of a message that is parsed
 
 constexpr const char* kForbidden = "open the address that vla serve has printed: it ends with a token\n";
 constexpr const char* kNoFolder = "vla serve was started without a folder for recordings: --record DIR\n";
@@ -40,7 +40,7 @@ std::string text_of(std::span<const std::byte> bytes) {
   return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
 }
 
-/// The value of a name in `a=1&b=2`; empty where it is not there. Ours need no escapes.
+/// The value of a name in `a=1&b=2`; empty if the name is missing. The page's own values need no escapes.
 std::string_view value_of(std::string_view query, std::string_view name) {
   while (!query.empty()) {
     const std::string_view part = query.substr(0, query.find('&'));
@@ -58,7 +58,7 @@ std::uint64_t number_of(std::string_view query, std::string_view name) {
   return number;
 }
 
-/// The view of an act, in place.
+/// A view of an act. It points into the act's bytes.
 struct View {
   std::span<const std::byte> message;
   std::string_view name;
@@ -79,7 +79,8 @@ struct View {
   }
 };
 
-/// Walks over a message up to its end, or to what is no field: what was refused is shown as far as it goes.
+/// Calls `use` for each field of a message, up to its end or to the first invalid field: a refused message is shown as
+/// far as it is valid.
 template <class Use>
 void each_field(std::span<const std::byte> message, const Use& use) {
   for (wire::Fields field(message, "act");;) {
@@ -113,7 +114,7 @@ Json record_json(const Recordings& recordings) {
           {"bytes", standing.bytes}, {"max_bytes", recordings.max_bytes()}, {"why", standing.why}};
 }
 
-/// A PPM file, which the page draws itself: encoding would cost more than all else.
+/// A PPM file, which the page draws itself: encoding would cost more than everything else.
 HttpReply pixmap(std::uint32_t width, std::uint32_t height, std::string_view rgb) {
   return {.type = "image/x-portable-pixmap", .body = fmt::format("P6 {} {} 255\n", width, height).append(rgb)};
 }
@@ -145,12 +146,12 @@ Json robot_json(const v1::Description& robot, const std::map<std::string, Page::
   return json;
 }
 
-/// The beginning of a text; its end, where that is missing, says so.
+/// The beginning of a text, with `...` in place of the rest.
 std::string beginning(std::string_view text, std::size_t size) {
   return text.size() <= size ? std::string(text) : std::string(text.substr(0, size)) + "...";
 }
 
-/// The first elements of a repeated field, made by `make`.
+/// The first `count` elements of a repeated field, converted by `make`.
 template <class Field, class Make>
 Json first_of(const Field& field, std::size_t count, const Make& make) {
   Json json = Json::array();
@@ -175,7 +176,7 @@ Json chunk_json(const v1::ActionChunk& chunk) {
           {"stages", first_of(chunk.stages(), kMaxStages, stage_json)}};
 }
 
-/// Adds a state's values to `states`; `left` is what the act may still have of them.
+/// Adds a state's values to `states`; `left`: how many values of the act may still be shown.
 void add_state(std::span<const std::byte> message, Json& states, std::size_t& left) {
   v1::State state;
   if (states.size() == kMaxStates || message.size() > kMaxMessage ||
@@ -215,7 +216,7 @@ Json act_json(std::span<const std::byte> act) {
   return json;
 }
 
-/// Frames as pixels; nothing where their number is not what their sides say.
+/// Returns a raw frame as a pixmap; 404 if the number of pixels does not match its width and height.
 HttpReply raw_frame(std::span<const std::byte> message) {
   std::uint64_t width = 0, height = 0;
   std::string_view rows;
@@ -240,17 +241,17 @@ std::size_t on_heap(const std::string& text) {
 
 struct Page::Act {
   std::uint64_t id = 0;
-  std::int64_t at_ms = 0;  // of its receipt, since 1970
+  std::int64_t at_ms = 0;  // time of receipt, since 1970
   double total_ms = 0;     // from receipt to its answer
   std::string client, name, code;
   std::string in, out;
   std::size_t size = 0;  // in memory
 
-  /// The serialized v1::Act; empty where the request is none.
+  /// The serialized v1::Act; empty if the request is not an act.
   std::span<const std::byte> act() const {
     const auto request = std::as_bytes(std::span(in));
     wire::Envelope envelope;
-    wire::read_envelope(request, envelope).ok();  // what was refused is shown too
+    wire::read_envelope(request, envelope).ok();  // refused acts are shown too
     return envelope.kind == wire::Kind::act ? envelope.body(request) : std::span<const std::byte>();
   }
 
@@ -347,7 +348,7 @@ bool Page::show(const Recording::Record& record) {
 }
 
 void Page::keep(const std::shared_ptr<Act>& act, std::span<const std::byte> in, std::span<const std::byte> out) {
-  constexpr std::size_t kRoom = sizeof(Act) + 64;  // with its count of owners, its place in line, and what malloc adds
+  constexpr std::size_t kRoom = sizeof(Act) + 64;  // adds reference counts, its place in `acts_` and malloc's overhead
   if (in.size() + out.size() > kMaxBytes) return;
   act->in = text_of(in), act->out = text_of(out);
   act->size = kRoom;
@@ -399,7 +400,7 @@ HttpReply Page::acts_after(std::uint64_t id) {
       found.push_back(*act);
   }
   const Health health = sources_.health();
-  Json record;  // null of a recording that is shown
+  Json record;  // null if the page shows a recording
   if (sources_.is_server) record = sources_.recordings ? record_json(*sources_.recordings) : Json{{"on", false}};
   const Json json = {{"ready", health.ready},
                      {"waiting", health.n_waiting},

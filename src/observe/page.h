@@ -16,11 +16,11 @@
 
 namespace vla::observe {
 
-/// A live page for people: `/` is the page, which asks `/policy` once, `/acts?after=N` for what was answered since, and
-/// `/image?act=N&view=I` for frames, `&as=seen` for what the network got of them. POST to `/record?on=1` or `on=0`
-/// begins and ends a recording. Every request needs `token=`, which is drawn anew for each server and is no other
-/// secret, since browsers keep addresses. The last acts are kept, up to a size in memory; a viewer that falls behind
-/// misses some, and holds nothing up. Of a refused act, which may hold anything, only the beginning is told.
+/// A live page for people. `/` is the page. It requests `/policy` once, `/acts?after=N` for newly answered acts, and
+/// `/image?act=N&view=I` for frames, with `&as=seen` as the network gets them. POST to `/record?on=1` or `on=0` begins
+/// or ends a recording. Every request needs `token=`, which is drawn anew for each server and protects nothing else,
+/// since browsers keep addresses. The last acts stay in memory, up to a size; a viewer that falls behind misses some
+/// and delays nobody. Of a refused act, which may contain anything, only the beginning is shown.
 class Page final : public Observer {
  public:
   struct Range {
@@ -30,31 +30,31 @@ class Page final : public Observer {
     std::string token;
     std::function<bool(std::string_view given, std::string_view token)> is_same;
     std::function<Health()> health;
-    Recordings* recordings = nullptr;  // of the server, where it was given a folder for them
-    bool is_server = true;             // and not a recording that is shown
+    Recordings* recordings = nullptr;  // the server's; null without a folder for them
+    bool is_server = true;             // false: the page shows a recording
   };
-  /// What the network gets of a view of this act, as a picture of 8 bits. Errors: bad_observation, too_large.
+  /// Returns a view of this act as the network gets it, an 8-bit picture. Errors: bad_observation, too_large.
   using See = std::function<Result<Frame>(const v1::Act& act, int view)>;
   /// As Http::open.
   static Result<std::unique_ptr<Page>> open(const std::string& address, bool insecure, Sources sources);
 
-  /// The policy, where its states were in training and where its actions may be, by name, and how it sees, if that is
-  /// known; before the first request. Infinite ends are none.
+  /// Sets the policy, the training ranges of its states (`ranges`, by EMBODIMENT/STATE), the limits of its actions (by
+  /// name), and `see`, which may be empty. Call it before the first request. An infinite end is no limit.
   void describe(const v1::Description& description, const std::map<std::string, Range>& ranges,
                 const std::map<std::string, Range>& limits, See see);
   void answered(const Answered& answered) override;
-  /// A request and its answer of a recording. False for one that is no act, which is not shown.
+  /// Adds a recorded request and its answer. Returns false, and does not show it, if the answer is neither a chunk nor
+  /// an error.
   bool show(const Recording::Record& record);
   bool records() const override { return true; }
 
   const std::string& address() const { return http_->address(); }
-  /// For a browser.
+  /// The address for a browser, with the token.
   std::string url() const;
 
-  /// An answered act, as the bytes that went over the wire. What is told of them is made when a viewer asks, on the
-  /// thread of Http.
+  /// An answered act, as serialized messages. Their JSON is made when a viewer asks, on Http's thread.
   struct Act;
-  /// Of the acts that are kept, with what each takes beside its bytes.
+  /// Maximum memory of the kept acts, with the overhead of each.
   static constexpr std::size_t kMaxBytes = 96 << 20;
 
  private:
@@ -74,14 +74,14 @@ class Page final : public Observer {
   std::size_t bytes_ = 0;
   std::string policy_ = "{}";
   See see_;
-  /// The last pictures that were made, so that a second viewer costs nothing; of the thread of Http.
+  /// The last pictures, kept so that a second viewer costs nothing. Only Http's thread uses them.
   struct Seen {
     std::uint64_t act = 0;
     std::size_t view = 0;
     Result<Frame> picture;
   };
   std::deque<Seen> seen_;
-  std::unique_ptr<Http> http_;  // last: its thread asks the others
+  std::unique_ptr<Http> http_;  // last member: its thread uses the others
 };
 
 }  // namespace vla::observe

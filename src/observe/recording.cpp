@@ -16,9 +16,9 @@ namespace vla::observe {
 namespace {
 
 constexpr std::string_view kMagic = "VLAREC2\n";
-constexpr std::size_t kHead = 40, kSealed = 32;  // bytes of a record before its request; of them under the checksum
+constexpr std::size_t kHead = 40, kSealed = 32;  // bytes of a record's head; how many of them the checksum covers
 constexpr std::size_t kMaxRecordBacklog = 128 << 20;
-constexpr std::uint64_t kLatestNs = 4'102'444'800 * 1'000'000'000ULL;  // 2100: a record whose pace can be kept
+constexpr std::uint64_t kLatestNs = 4'102'444'800 * 1'000'000'000ULL;  // the year 2100: keeps replay times in range
 
 using Head = std::array<char, kHead>;
 
@@ -83,7 +83,7 @@ Recorder::Recorder(std::string path, int fd, std::uint64_t max_bytes)
   writer_.put(std::string(kMagic));
 }
 
-/// A server that never got to serve leaves no file in the way of the next one.
+/// Without a single record, removes the file, so that it does not block the next server.
 void Recorder::close() {
   if (n_record_ > 0) {
     writer_.set_tail(record_of("VEND", n_record_, 0, 0, "", ""));
@@ -123,11 +123,11 @@ void Recorder::add(const Came& came, std::span<const std::byte> in, std::span<co
 }
 
 void Recorder::stop(const char* why) {
-  why_stopped_ = "no memory";  // which this text takes none of
+  why_stopped_ = "no memory";  // short enough to need no allocation
   try {
     why_stopped_ = why;
     if (tell_) tell_(why_stopped_, n_recorded());
-  } catch (const std::exception&) {  // no memory to tell it
+  } catch (const std::exception&) {  // no memory to report it
   }
 }
 

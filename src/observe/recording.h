@@ -19,7 +19,8 @@ namespace vla::observe {
 /// three little-endian u32 (its index from 0, bytes of the request, bytes of the answer), three u64 (a number that
 /// tells connections apart; when the request came, in nanoseconds since 1970; XXH3-64, chained over these 32 bytes, the
 /// request and the answer), the Request and the Response. Record 0 has the server's Description as its request and no
-/// answer. Times are the system's when the file was opened, counted on by a clock that nobody sets.
+/// answer. Times are the system time when the file was opened plus the time since then by the steady clock, which
+/// nobody sets.
 constexpr const char* kRecordingFile = "requests.vlarec";
 
 /// Records requests and answers, up to a size.
@@ -29,7 +30,8 @@ class Recorder final : public Observer {
   static Result<std::unique_ptr<Recorder>> open(const std::string& folder, std::uint64_t max_bytes);
   ~Recorder() override { close(); }
 
-  /// Writes what waits and ends the file. If the disk failed meanwhile, recording stopped then, and nobody was told.
+  /// Writes the waiting records and ends the file. If the disk failed in the meantime, only why_stopped() reports it,
+  /// not `on_stop`.
   void close();
 
   /// Describes the server. Call it before the first request.

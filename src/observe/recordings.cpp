@@ -27,7 +27,7 @@ Status Recordings::open() {
   return begin_in(folder_);
 }
 
-/// What could not be written any more is told too.
+/// Reports also a recording whose last data could not be written.
 Recordings::~Recordings() {
   const bool was_on = standing().on;
   close();

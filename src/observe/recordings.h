@@ -20,7 +20,7 @@ class Recordings final : public Observer {
   struct Standing {
     bool on = false;
     std::string folder;           // empty before the first one
-    std::uint64_t n_request = 0;  // in it
+    std::uint64_t n_request = 0;  // requests in the recording
     std::uint64_t bytes = 0;      // bytes of all recordings
     std::string why;              // why it ended by itself; else empty
   };

@@ -36,12 +36,12 @@ const char* name_of(v1::Response::KindCase kind) {
   }
 }
 
-/// Collects what differs between two answers.
+/// Collects the differences between two answers.
 struct Comparison {
   std::vector<Difference> differences;
 
   void field(const char* name, const std::string& recorded, const std::string& replayed) {
-    constexpr std::size_t kShown = 500;  // bytes: a server may say as much as a message holds
+    constexpr std::size_t kShown = 500;  // bytes: a server's text may be as long as a message
     if (recorded != replayed)
       differences.push_back({0, 0, name, recorded.substr(0, kShown), replayed.substr(0, kShown)});
   }
@@ -85,7 +85,7 @@ bool is_of_the_moment(const v1::Response& answer) {
       return true;
     case v1::Error::OUT_OF_MEMORY:
       return true;
-    case v1::Error::TOO_LARGE:  // of these two the request was not kept whole
+    case v1::Error::TOO_LARGE:  // these two refusals have an incomplete request in the recording
       return error.where() == "request";
     case v1::Error::BAD_REQUEST:
       return error.found() == "several";
@@ -105,8 +105,8 @@ std::string request_again(const std::string& request, const v1::Response& record
   return again.SerializeAsString();
 }
 
-/// One connection to a server, one request at a time. A server that is not there, or goes away, is noticed at once and
-/// not when an answer is overdue.
+/// One connection to a server, one request at a time. It notices at once that a server is missing or goes away, not
+/// only when an answer is overdue.
 class Line {
  public:
   Line(const ReplayOptions& options) : options_(options), socket_(context_, zmq::socket_type::dealer) {

@@ -20,7 +20,8 @@ constexpr std::size_t kMaxTraceBacklog = 16 << 20;
 constexpr std::size_t kMaxTail = 128;           // bytes
 constexpr int kIo = 1, kEngine = 2, kHost = 3;  // tracks
 
-/// Trace events count in microseconds; three digits keep the nanoseconds, so that what nests still nests.
+/// Formats a time in microseconds, the unit of trace events. Three decimals keep nanoseconds, so that nested slices
+/// stay nested.
 std::string us(std::int64_t ns) { return fmt::format("{}.{:03}", ns / 1000, ns % 1000); }
 
 std::string name_of_thread(int tid, const char* name) {
@@ -75,7 +76,7 @@ std::string slices_of_act(const Answered& answered, std::int64_t from, std::int6
 
 Result<std::unique_ptr<Trace>> Trace::open(const std::string& path, std::size_t max_bytes) {
   VLA_TRY(const int fd, open_to_write(path, false));
-  // With room for the end, which the first events take the place of.
+  // Reserves space for the tail with blanks, which the first events overwrite.
   const std::string head = head_of_file(), begun = head + std::string(kMaxTail, ' ');
   if (!write_all(fd, std::as_bytes(std::span(begun))) || ::lseek(fd, static_cast<off_t>(head.size()), SEEK_SET) < 0) {
     const int number = errno;
@@ -90,7 +91,8 @@ Result<std::unique_ptr<Trace>> Trace::open(const std::string& path, std::size_t 
 
 Trace::Trace(int fd, std::size_t max_bytes) : max_bytes_(max_bytes), writer_(fd, Writer::Owns::yes, kMaxTraceBacklog) {}
 
-/// An array needs an element after the last comma, also where the disk is full: every event is longer than this.
+/// Closes the array: after the last comma it needs an element. On a full disk this element replaces the last event,
+/// since every event is longer.
 Trace::~Trace() {
   writer_.set_tail(
       fmt::format(R"({{"ph":"M","pid":1,"name":"process_name","args":{{"name":"vla serve","dropped":{}}}}})"
@@ -103,7 +105,7 @@ std::int64_t Trace::ns(Clock::time_point time) const {
   return std::max<std::int64_t>(0, std::chrono::nanoseconds(time - start_).count());
 }
 
-/// Every name that goes into the file is the server's own; of a client there is the number of its connection.
+/// Writes only names that the server chooses. A client appears as the name of its connection.
 void Trace::answered(const Answered& answered) {
   const Received& request = answered.request;
   const std::uint64_t id = ++n_request_;

@@ -11,12 +11,12 @@
 namespace vla::observe {
 
 /// Events for Perfetto and chrome://tracing: a track of each request from receipt to answer with its time in the queue,
-/// and the acts of the engine with their stages. Streams to the file: an array that is whole also where the disk is
-/// full, and that Perfetto reads also where a killed process has not closed it.
+/// and the acts of the engine with their stages. Streams a JSON array to the file. The array is complete even on a full
+/// disk, and Perfetto reads it even if a killed process did not close it.
 class Trace final : public Observer {
  public:
   static constexpr std::size_t kMaxBytes = std::size_t{1} << 30;
-  /// Replaces the file. What comes after `max_bytes` is dropped and counted. Errors: io.
+  /// Replaces the file. Events beyond `max_bytes` are dropped and counted. Errors: io.
   static Result<std::unique_ptr<Trace>> open(const std::string& path, std::size_t max_bytes = kMaxBytes);
   ~Trace() override;
 
@@ -30,7 +30,7 @@ class Trace final : public Observer {
 
   const Clock::time_point start_ = Clock::now();
   const std::size_t max_bytes_;
-  std::uint64_t n_request_ = 0;  // of the I/O thread, as the bytes are
+  std::uint64_t n_request_ = 0;  // for the I/O thread only, like `n_byte_`
   std::size_t n_byte_ = 0;
   std::atomic<std::uint64_t> n_beyond_ = 0;
   Writer writer_;

@@ -18,7 +18,7 @@
 namespace vla::observe {
 namespace {
 
-constexpr auto kPatience = std::chrono::seconds(2);  // with a pipe without a reader, at shutdown
+constexpr auto kPatience = std::chrono::seconds(2);  // at shutdown, for a pipe without a reader
 constexpr int kPollMs = 100;
 
 }  // namespace
@@ -28,7 +28,7 @@ Result<int> open_to_write(const std::string& path, bool fresh) {
   const int fd = ::open(path.c_str(), flags, 0600);
   struct stat info;
   const bool is_file = fd >= 0 && ::fstat(fd, &info) == 0 && S_ISREG(info.st_mode);
-  if (is_file && !fresh && ::fchmod(fd, 0600) != 0) errno = 0;  // of another user's file: as it is
+  if (is_file && !fresh && ::fchmod(fd, 0600) != 0) errno = 0;  // another user's file keeps its mode
   if (fd >= 0) return fd;
   if (errno == EEXIST) return Error{Code::io, path, "no such file yet", "one", "name another place, or remove it"};
   if (errno == ELOOP) return Error{Code::io, path, "a file", "a symbolic link", "name the file that it leads to"};
@@ -70,7 +70,7 @@ bool Writer::put(std::string piece) noexcept {
       changed_.notify_one();
       return true;
     }
-  } catch (const std::bad_alloc&) {  // a line less, and the server goes on
+  } catch (const std::bad_alloc&) {  // the piece is dropped; the server continues
   }
   ++n_dropped_;
   return false;
@@ -100,7 +100,7 @@ bool Writer::is_out_of_patience() const {
   return closing_ && std::chrono::steady_clock::now() - closing_since_ > kPatience;
 }
 
-/// A pipe takes PIPE_BUF bytes at once without blocking where it says that it takes any.
+/// A pipe that poll reports as writable takes PIPE_BUF bytes without blocking.
 bool Writer::write_all(const std::string& piece) {
   for (std::size_t at = 0; at < piece.size() && failure_ == 0;) {
     pollfd item = {fd_, POLLOUT, 0};
@@ -122,11 +122,11 @@ bool Writer::write_all(const std::string& piece) {
     position_ += static_cast<std::int64_t>(piece.size());
     return true;
   }
-  [[maybe_unused]] const int cut = is_file_ ? ::ftruncate(fd_, position_) : 0;  // a full disk keeps the whole pieces
+  [[maybe_unused]] const int cut = is_file_ ? ::ftruncate(fd_, position_) : 0;  // a full disk keeps whole pieces only
   return false;
 }
 
-/// A disk that is full still has the place of the last piece.
+/// On a full disk, the tail overwrites the last piece: that space is already allocated.
 void Writer::write_tail() {
   write_all(tail_);
   if (failure_ == 0 || !is_file_ || !over_last_) return;

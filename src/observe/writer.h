@@ -15,31 +15,32 @@
 
 namespace vla::observe {
 
-/// Opens a file to be written from its start, which must not exist yet where `fresh`. Only its owner may read it, since
-/// it holds what a robot sees and does. A symbolic link is refused: another user may have put it there. Errors: io.
+/// Opens a file to write it from its start. With `fresh` it must not exist yet. Only its owner may read it, since it
+/// holds what a robot sees and does. A symbolic link is refused: another user may have put it there. Errors: io.
 Result<int> open_to_write(const std::string& path, bool fresh);
 
-/// Writes to a file or a pipe from a thread of its own, so that the caller never waits for a disk
-/// or for a reader. Pieces are written whole and in order; one that finds the line full is dropped and counted.
+/// Writes to a file or a pipe from a thread of its own, so that the caller never waits for a disk or for a reader.
+/// Pieces are written whole and in order; a piece that finds the queue full is dropped and counted.
 class Writer {
  public:
   enum class Owns { no, yes };
-  /// `fd` is closed at the end where it is owned. At most `max_waiting` bytes wait. Without a thread it has failed from
-  /// the start. A closed pipe is a failure too, not a signal.
+  /// Closes `fd` at the end if it owns it. At most `max_waiting` bytes wait. If the thread cannot start, `failure` is
+  /// set from the beginning. A closed pipe is a failure too, not a signal.
   Writer(int fd, Owns owns, std::size_t max_waiting);
   ~Writer() { close(); }
   Writer(const Writer&) = delete;
   Writer& operator=(const Writer&) = delete;
 
-  /// From any thread. False where the piece was dropped.
+  /// Queues a piece. Returns false if the piece is dropped. Any thread may call it.
   bool put(std::string piece) noexcept;
-  /// Writes what waits, then `tail`, for as long as somebody reads, and closes the file. Nothing may be put afterwards.
+  /// Writes the waiting pieces, then the tail, while somebody reads, and closes an owned file. Call no `put`
+  /// afterwards.
   void close();
-  /// Sets the text that comes after every piece that was put, and is not dropped. Where the disk is full, nothing comes
-  /// after what is there; or, `over_last`, the text takes the place of the last piece of a file.
+  /// Sets the text that `close` writes after all pieces, whether the queue is full or not. On a full disk it is left
+  /// out, or, with `over_last`, overwrites the last piece of a file.
   void set_tail(std::string tail, bool over_last = false) { tail_ = std::move(tail), over_last_ = over_last; }
   std::uint64_t n_dropped() const { return n_dropped_; }
-  /// The system's number of what went wrong; from then on everything is dropped.
+  /// The failure's errno, or 0. After a failure every piece is dropped.
   int failure() const { return failure_; }
 
  private:
@@ -52,7 +53,7 @@ class Writer {
   const Owns owns_;
   const std::size_t max_waiting_;
   bool is_file_ = false;
-  std::int64_t position_ = 0, last_ = 0;  // of a file: where the next whole piece goes, and where the last one begins
+  std::int64_t position_ = 0, last_ = 0;  // in a file: offset of the next piece, and of the last one written
   std::string tail_;
   bool over_last_ = false;
   std::atomic<std::uint64_t> n_dropped_ = 0;

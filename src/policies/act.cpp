@@ -22,8 +22,8 @@ struct ViewRun {
   int width, height, first, count;
 };
 
-/// `view_sizes`: width and height of each view's frames, in the upper left corner of images of one size; without the
-/// key frames are as large as images.
+/// Reads `view_sizes`: width and height of each view's frame, which lies in the upper left corner of an image of the
+/// common size. Without the key every frame fills its image, and the result is empty.
 std::vector<ViewRun> read_runs(const Scope& s) {
   std::vector<ViewRun> runs;
   if (!s.has("view_sizes")) return runs;
@@ -41,10 +41,10 @@ std::vector<ViewRun> read_runs(const Scope& s) {
 
 class Act final : public Policy {
   int d_state_, d_environment_, horizon_;
-  int n_token_;  // tokens before those of the views: style, robot, environment
+  int n_token_;  // tokens before the view tokens: style, robot, environment
   DetrFamily family_;
   ResNet vision_;              // observation rate
-  std::vector<ViewRun> runs_;  // none: all views have the images' size
+  std::vector<ViewRun> runs_;  // empty: every frame fills its image
   Linear projector_;
   Embedding position_;
   const Param* style_;

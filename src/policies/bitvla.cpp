@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // BitVLA: SigLIP and BitNet b1.58 with ternary weights and 8-bit activations. Parallel decoding: after the prompt the
 // language model reads a zero embedding for each value of a chunk, with full attention, and an MLP-ResNet turns the
-// features there into actions in one pass. Reference: BitVLA openvla-oft bitvla/model/bitvla_for_action_prediction.py
-// (predict_action)
+// features at these embeddings into actions in one pass. Reference: BitVLA openvla-oft
+// bitvla/model/bitvla_for_action_prediction.py (predict_action)
 
 #include "modules/action/mlp_resnet.h"
 #include "modules/language/qwen.h"
@@ -64,7 +64,7 @@ class BitVla final : public Policy {
     const Tensor actions = full(g, 0.0f, lm_.d_model(), n_action_token_);
     const Tensor stop = lm_.embed(g, constant_ids(g, "stop", {stop_token_}));
     const Tensor y = lm_.bidirectional(g, g.name("prefix", concat_tokens(g, {prompt, actions, stop})));
-    // The reference reads each action one row before its slot.
+    // The reference takes the features of each action from the token before it.
     cache.put(g, "action_rows", reshape_width(g, compute_tokens(g, y, n_text - 1, n_action_token_), d_row_));
   }
 

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-// Diffusion Policy: ResNet towers end in keypoints; those of all cameras and the state, at the last few observation
-// steps, condition a U-Net over the rows of a chunk, from which a scheduler takes away noise. It reads no instruction.
-// Reference: lerobot src/lerobot/policies/diffusion/modeling_diffusion.py
+// Diffusion Policy: ResNet towers end in keypoints. The keypoints of all cameras and the state, at the last few
+// observation steps, condition a U-Net that predicts the noise of a chunk; a scheduler removes it step by step. It
+// reads no instruction. Reference: lerobot src/lerobot/policies/diffusion/modeling_diffusion.py
 
 #include <fmt/format.h>
 
@@ -18,7 +18,7 @@ namespace {
 /// The features of a camera's frames.
 class CameraEncoder {
  public:
-  /// With the keys of `keys`, which all cameras share.
+  /// `keys`: the path of the configuration keys, which all cameras share; `s`: the path of the weights.
   CameraEncoder(const Scope& keys, const Scope& s)
       : n_keypoint_(keys.dim("n_keypoint", 4096)),
         resnet_(keys, s),
@@ -49,8 +49,8 @@ std::vector<CameraEncoder> read_encoders(const Scope& s, int n_camera) {
   return encoders;
 }
 
-/// An observation has `n_moment` moments, the oldest first. Views are ordered by camera, then by moment, and so is the
-/// state: the robot's of all moments, then the environment's.
+/// An observation has `n_moment` moments (observation steps), the oldest first. Views are ordered by camera, then by
+/// moment. The state holds the robot's state of all moments, then the environment's.
 class Diffusion final : public Policy {
   int d_robot_, d_environment_, n_moment_, n_camera_, horizon_;
   std::vector<CameraEncoder> encoders_;  // observation rate: one for all cameras, or one for each; none without cameras
@@ -126,7 +126,7 @@ class Diffusion final : public Policy {
     g.end_stage("vision");
     return features;
   }
-  /// Numbers of the state from `first` on, `d` of each moment: [d, n_moment].
+  /// The part of the state that begins at `first` and has `d` numbers per moment: [d, n_moment].
   Tensor of_moments(Graph& g, Tensor state, int first, int d) const {
     return reshape(g, slice_features(g, state, first, n_moment_ * d), {d, n_moment_, 1, 1});
   }

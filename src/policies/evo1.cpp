@@ -24,7 +24,7 @@ namespace {
 constexpr int kTimes = 1000;  // rows in the reference's time table
 
 class Evo1 final : public Policy {
-  /// How padding in the prompt and image tokens of absent views are treated.
+  /// How the prompt's padding and the image tokens of absent views are treated.
   enum class MaskedRows {
     zero_attention,    // flash-attention: the row attends to nothing else, and the head sees it
     causal_attention,  // other attention: the row sees the rows before it, and the head sees it
@@ -95,7 +95,7 @@ class Evo1 final : public Policy {
   bool depends_on_which_views() const override { return in_place_; }
 
   Tensor condition(Graph& g, std::span<const SolverTime> times) const override {
-    // The reference looks up its time table by the time in double.
+    // The reference computes the row of its time table from the time in double precision.
     std::vector<std::int32_t> rows;
     for (const SolverTime& time : times)
       rows.push_back(std::min(kTimes - 1, static_cast<int>(time.exact * time_scale_)));
@@ -129,7 +129,7 @@ class Evo1 final : public Policy {
   }
 
  private:
-  /// Splits the rows into those that the language model reads and those that only the head sees.
+  /// The rows that the language model reads, and those that only the head sees.
   struct Rows {
     std::vector<Tensor> parts;  // [d_model, n] each
     std::vector<int> positions;
@@ -157,7 +157,7 @@ class Evo1 final : public Policy {
     return slots;
   }
 
-  /// Tokens keep their positions in the whole prompt, whatever is left out.
+  /// Tokens keep their positions in the whole prompt, even if others are left out.
   Rows arrange(Graph& g, Tensor image, const PrefixInputs& in, const Cache& cache) const {
     Rows rows;
     int n_absent = 0;

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// GR00T N1.6: Eagle 3 prefix (SigLIP 2, the first layers of Qwen3 and its final norm) with the views behind the
-// instruction, a diffusion transformer that looks at text and images in turn, flow matching from noise (t = 0) to
+// GR00T N1.6: Eagle 3 prefix (SigLIP 2, the first layers of Qwen3 and its final norm) with the views after the
+// instruction, a diffusion transformer that attends to text and images in turn, flow matching from noise (t = 0) to
 // actions (t = 1). References: Isaac-GR00T gr00t/model/gr00t_n1d6/gr00t_n1d6.py; transformers modeling_siglip2.py,
 // modeling_qwen3.py; lerobot src/lerobot/policies/groot (groot_n1_7.py).
 

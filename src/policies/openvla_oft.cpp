@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 // OpenVLA-OFT: OpenVLA's towers see one to three cameras, and its Llama 2 reads a token for each number of a whole
-// chunk, with full attention. An MLP-ResNet turns the features there into actions in one pass, or into the noise that
-// DDIM takes away step by step. FiLM lets the instruction modulate the towers. Reference: openvla-oft
+// chunk, with full attention. An MLP-ResNet turns the features at these tokens into actions in one pass, or into the
+// noise that DDIM removes step by step. FiLM lets the instruction modulate the towers. Reference: openvla-oft
 // prismatic/extern/hf/modeling_prismatic.py (OpenVLAForActionPrediction.predict_action)
 
 #include "modules/action/mlp_resnet.h"
@@ -19,7 +19,7 @@ namespace {
 class OpenVlaOft final : public Policy {
   bool is_modulated_, denoises_;
   int d_action_, n_action_token_, stop_token_;
-  Qwen lm_;  // observation rate, with DDIM step rate
+  Qwen lm_;  // observation rate; step rate with DDIM
   PrismaticVision vision_;
   std::optional<TokenProjector> state_;
   std::optional<TokenProjector> noisy_action_;  // step rate
@@ -81,8 +81,8 @@ class OpenVlaOft final : public Policy {
  private:
   Tensor stop(Graph& g) const { return lm_.embed(g, constant_ids(g, "stop", {stop_token_})); }
 
-  /// Features at the actions [d_model, n_action_token] behind a prompt, which together are called `name`: [d_model *
-  /// d_action, horizon]. The reference reads each one row before its slot.
+  /// The features of the tokens `actions` [d_model, n_action_token] after a prompt: [d_model * d_action, horizon]. The
+  /// whole sequence is the tap `name`. The reference takes the features of each action from the token before it.
   Tensor rows(Graph& g, std::vector<Tensor> prompt, Tensor actions, const char* name) const {
     int n_prompt = 0;
     for (const Tensor& part : prompt) n_prompt += static_cast<int>(part.dim(1));
@@ -91,7 +91,7 @@ class OpenVlaOft final : public Policy {
     return reshape_width(g, compute_tokens(g, y, n_prompt - 1, n_action_token_), lm_.d_model() * d_action_);
   }
 
-  /// The mean of tokens: [d_model, n] -> [d_model, 1]. It is an attention whose query is zero.
+  /// The mean of tokens, computed as an attention with a zero query: [d_model, n] -> [d_model, 1].
   Tensor mean(Graph& g, Tensor x) const {
     const Tensor heads = split_heads(g, x, lm_.heads().n_head);
     return attention(g, split_heads(g, full(g, 0.0f, lm_.d_model(), 1), lm_.heads().n_head), {{heads, heads}}, {});

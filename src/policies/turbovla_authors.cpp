@@ -69,13 +69,14 @@ class StateTokens : public Module<StateTokens> {
 };
 
 class TurboVlaAuthors final : public Policy {
-  /// Rows after the text: every layer computes them, they are zeros before the first layer, or after every layer too.
+  /// Rows after the text. kept: every layer computes them. zeroed_first: zeros before the first layer. zeroed: zeros
+  /// after every layer, too.
   enum class Padding { kept, zeroed_first, zeroed };
 
   int horizon_, n_view_, n_row_;  // n_row: text rows in the layers; 0: the number of tokens
   bool apart_, patch_places_;
   Padding padding_;
-  std::vector<int> sentence_ends_;  // ids
+  std::vector<int> sentence_ends_;  // ids of the tokens that end a sentence
   int text_end_;
   DetrFamily family_;
   DinoV3 vision_;  // observation rate
@@ -146,9 +147,9 @@ class TurboVlaAuthors final : public Policy {
     return check_prefix(shape.n_view, vision_.n_patch(), n_row + state_in_.n_token());
   }
 
-  /// A sentence is the tokens up to an end token, which attend to each other. The first and the last token, and tokens
-  /// that no end token follows, attend to themselves only. Tokens after the last text_end are padding. Source:
-  /// generate_masks_with_special_tokens.
+  /// A sentence is the tokens up to and including an end token; they attend to each other. The first and the last
+  /// token, and tokens that no end token follows, attend to themselves only. Tokens after the last text_end are
+  /// padding. Source: generate_masks_with_special_tokens.
   TextLayout text_layout(std::span<const std::int32_t> tokens) const override {
     const int n = static_cast<int>(tokens.size());
     TextLayout layout = {.n_seen = n, .sentences = {}};
@@ -208,7 +209,7 @@ class TurboVlaAuthors final : public Policy {
   }
 
  private:
-  /// BERT's output, filled up with zeros to n_row, projected: [d_model, n_row].
+  /// BERT's output, padded with zeros to n_row rows and projected: [d_model, n_row].
   Tensor text_rows(Graph& g, Tensor tokens, const TextLayout& layout) const {
     const int n = static_cast<int>(tokens.dim(0));
     Tensor hidden;

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-// VLA-Adapter: OpenVLA's towers, and a Qwen2.5 0.5B that reads action queries behind the prompt. Each layer of a head
-// attends to what one layer of the language model returns for image and queries, and the last one gives a whole chunk.
+// VLA-Adapter: OpenVLA's towers, and a Qwen2.5 0.5B that reads action queries after the prompt. Each layer of the head
+// attends to the image and query features of one layer of the language model; the last layer returns a whole chunk.
 // Reference: VLA-Adapter prismatic/extern/hf/modeling_prismatic.py (OpenVLAForActionPrediction.predict_action,
 // _regression_or_discrete_prediction), prismatic/models/{action_heads,projectors}.py
 
@@ -52,8 +52,8 @@ class VlaAdapter final : public Policy {
     const Tensor image = vision_(g, in.images);  // [d_model, n_image]
     const Tensor text = lm_.embed(g, in.tokens);
     const int n_image = static_cast<int>(image.dim(1)), n_text = static_cast<int>(text.dim(1));
-    // What the reference calls features of the image begins one row before it, and those of queries begin one row
-    // before them, so that nothing reads the last query; attention is causal.
+    // The reference's image features begin one row before the image, and its query features one row before the queries.
+    // So nothing reads the last query, and since attention is causal, it can be left out.
     const Tensor queries = queries_(g, arange(g, n_query_ - 1));
     const Tensor x =
         g.name("prefix",

@@ -43,7 +43,7 @@ class VlaJepa final : public Policy {
 
   void constants(Graph& g, const std::function<Tensor()>&, Cache& cache) const override { backbone_.keep(g, cache); }
 
-  /// The embodied tokens end the prompt here. In the reference text follows them, which they do not see.
+  /// Here the embodied tokens end the prompt. In the reference text follows, to which they do not attend.
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
     const Tensor features = backbone_(g, in.images, in.tokens, cache);  // [d_model, n_text]
     const int n_before = static_cast<int>(features.dim(1)) - n_embodied_;
@@ -56,8 +56,8 @@ class VlaJepa final : public Policy {
   }
 };
 
-/// Qwen3-VL-2B and DiT-B with two views of LIBERO, 224 x 224 as the authors train and 256 x 256 as the backbone's
-/// processor takes them: 2.3 B parameters. Sources: lerobot policies/vla_jepa/configuration_vla_jepa.py, starVLA.
+/// Qwen3-VL-2B and DiT-B with two views of LIBERO, 224 x 224 in the authors' training, 256 x 256 after the backbone's
+/// processor: 2.3 B parameters. Sources: lerobot policies/vla_jepa/configuration_vla_jepa.py, starVLA.
 Keys VlaJepa::published() {
   // clang-format off
   return Keys({

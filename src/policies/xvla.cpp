@@ -2,9 +2,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // X-VLA: Florence-2's DaViT over the views, BART's encoder over the first view and the instruction, and a transformer
-// over rows of actions, what the encoder gives, the other views, and prompts that each domain has learned. It predicts
-// actions, not a velocity, from a mixture of noise and its last prediction. Action encoder, decoder and prompts are the
-// domain's. Reference: lerobot policies/xvla/modeling_xvla.py (XVLAModel), soft_transformer.py.
+// over rows of actions, the encoder's output, the other views, and the domain's learned prompts. It predicts actions,
+// not a velocity, from a mixture of noise and its last prediction. Each domain has its own action encoder, decoder and
+// prompts. Reference: lerobot policies/xvla/modeling_xvla.py (XVLAModel), soft_transformer.py.
 
 #include <fmt/format.h>
 
@@ -164,7 +164,7 @@ class XVla final : public Policy {
     return attention(g, zeros(1), {{zeros(x.dim(1)), values}}, {});
   }
 
-  /// The reference does not mask padding: its tokens count like words (XVLAModel.forward_vlm).
+  /// The reference does not mask padding: tokens attend to it as to words (XVLAModel.forward_vlm).
   Tensor text_tokens(Graph& g, Tensor ids) const {
     const int n_pad = n_token_ - static_cast<int>(ids.dim(0));
     const Tensor words = lm_.token().forward(g, ids);
@@ -173,7 +173,7 @@ class XVla final : public Policy {
     return concat_tokens(g, {words, lm_.token().forward(g, constant_ids(g, fmt::format("padding/{}", n_pad), pads))});
   }
 
-  /// All views but the first. Absent ones come last, whichever they are, with zeros in place of features.
+  /// All views but the first. Absent views come last, whichever they are, as zeros.
   Tensor other_views(Graph& g, Tensor image) const {
     const int n_other = static_cast<int>(image.dim(2)) - 1, n_absent = n_view_ - 1 - n_other;
     std::vector<Tensor> tokens;
@@ -182,7 +182,8 @@ class XVla final : public Policy {
     return aux_in_(g, concat_tokens(g, tokens));
   }
 
-  /// The network does not see the grippers, which it predicts. Source: action_hub.py, preprocess.
+  /// Sets the gripper columns to zero: the network predicts them but does not read them. Source: action_hub.py,
+  /// preprocess.
   Tensor without_grippers(Graph& g, Tensor x) const {
     if (grippers_.empty()) return x;
     const std::int64_t d = x.dim(0);

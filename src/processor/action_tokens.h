@@ -10,14 +10,14 @@
 
 namespace vla {
 
-/// How tokens that a language model answers with stand for a chunk.
+/// Decodes the tokens of a language model's answer to a chunk.
 class ActionTokens {
  public:
-  /// Reads `action_tokens.kind` and what the kind reads; nullopt where a bundle has none. Errors: bad_bundle.
+  /// Reads `action_tokens.kind` and the keys of that kind; nullopt if the bundle has no kind. Errors: bad_bundle.
   static Result<std::optional<ActionTokens>> read(const Keys& keys);
 
-  /// The chunk (horizon, d_action), normalized, of the ids that the language model gave, in order. `note` says where
-  /// they stand for none as they are. Errors: bad_action.
+  /// Decodes the ids of the answer, in order, to a normalized chunk (horizon, d_action). If the ids do not exactly
+  /// encode a chunk but can be read as one, `note` says how. Errors: bad_action.
   Result<std::vector<float>> decode(std::span<const std::int32_t> ids, int horizon, int d_action,
                                     std::string* note = nullptr) const;
 

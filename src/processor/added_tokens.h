@@ -29,15 +29,15 @@ struct AddedToken {
 /// Reads `tokenizer.added`. Errors: bad_bundle, also for ids from `n_vocab` on, and for repeated ids or contents.
 Result<std::vector<AddedToken>> parse_added_tokens(const std::string& json, int n_vocab);
 
-/// Finds added tokens in text: leftmost first, the longest of those that start at one place. Source: tokenizers
-/// added_vocabulary.rs (extract_and_normalize, find_matches).
+/// Finds added tokens in text: leftmost first, and the longest of those that start at the same place. Source:
+/// tokenizers added_vocabulary.rs (extract_and_normalize, find_matches).
 class AddedTokens {
  public:
-  /// Normalizes text and the contents of `normalized` tokens before those are searched for.
+  /// Normalizes text, and the contents of `normalized` tokens, before these tokens are searched for.
   using Normalize = std::string (*)(std::string_view);
 
   AddedTokens() = default;
-  /// `normalize` may be null: then text stays as it is.
+  /// If `normalize` is null, text is not normalized.
   explicit AddedTokens(std::vector<AddedToken> tokens, Normalize normalize = nullptr);
 
   /// Calls `on_text` for each non-empty, normalized piece between added tokens and `on_token` for each token's id, in
@@ -47,7 +47,7 @@ class AddedTokens {
 
  private:
   struct Node {
-    std::vector<std::pair<std::uint8_t, int>> next;  // by byte
+    std::vector<std::pair<std::uint8_t, int>> next;  // child nodes by byte
     int token = -1;                                  // index into tokens_ of the content that ends here
   };
   using Trie = std::vector<Node>;

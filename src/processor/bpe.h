@@ -18,7 +18,7 @@ namespace vla {
 /// itself); -1 for other characters.
 int byte_of_symbol(std::uint32_t code_point);
 
-/// The bytes that a token of this alphabet stands for; its own text where a character is none of it.
+/// The bytes that a token of this alphabet encodes; the token's own text if a character is not in the alphabet.
 std::string bytes_of_token(const std::string& text);
 
 /// Byte-level byte-pair encoding of one word, whose symbols are bytes. Source: tokenizers models/bpe/model.rs.

@@ -20,7 +20,7 @@ Result<ByteFallbackBpe> ByteFallbackBpe::create(const std::vector<std::string>& 
     const auto found = ids.find(fmt::format("<0x{:02X}>", byte));
     if (found != ids.end()) {
       bpe.byte_ids_[byte] = found->second;
-    } else if (byte > 0x7F || bpe.char_ids_.count(byte) == 0) {  // a token that is the character itself comes first
+    } else if (byte > 0x7F || bpe.char_ids_.count(byte) == 0) {  // the character's own token takes precedence
       return Error{Code::bad_bundle, "tokenizer.tokens", "a token for each of the 256 bytes",
                    fmt::format("none for <0x{:02X}>", byte)};
     }

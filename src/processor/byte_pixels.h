@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// byte / 255 of every byte.
+/// The values byte / 255 of all bytes.
 inline const std::array<float, 256>& byte_table() {
   static const std::array<float, 256> table = [] {
     std::array<float, 256> values{};
@@ -19,7 +19,7 @@ inline const std::array<float, 256>& byte_table() {
   return table;
 }
 
-/// Converts interleaved pixels to planes of what `value` makes of each.
+/// Converts interleaved pixels to planes and applies `value` to each number.
 template <class T, class Value>
 void spread(std::span<const T> rgb, std::span<float> out, Value value) {
   const std::size_t size = rgb.size() / 3;
@@ -32,7 +32,7 @@ inline void spread_bytes(std::span<const std::uint8_t> rgb, std::span<float> out
   spread(rgb, out, [&table = byte_table()](std::uint8_t byte) { return table[byte]; });
 }
 
-/// Pixels in [0, 1] times 255, without rounding; recovers bytes that were divided by 255.
+/// Truncates 255 times each pixel in [0, 1]; recovers bytes that were divided by 255.
 inline std::vector<std::uint8_t> cut_to_bytes(std::span<const float> pixels) {
   std::vector<std::uint8_t> bytes;
   bytes.reserve(pixels.size());

@@ -8,7 +8,7 @@
 namespace vla {
 
 std::vector<std::string> constant_actions(const Processor& processor, int horizon, int d_action) {
-  constexpr float kStill = 1e-5f;  // more than an epsilon, which keeps a division defined, moves an action
+  constexpr float kStill = 1e-5f;  // above the movement that the epsilon in a denominator causes
   const auto& dims = processor.state_dims();
   const std::vector<float> state(static_cast<std::size_t>(std::accumulate(dims.begin(), dims.end(), 0)));
   const auto chunk_of = [&](float value) {
@@ -16,7 +16,7 @@ std::vector<std::string> constant_actions(const Processor& processor, int horizo
   };
   const auto low = processor.decode(chunk_of(-1.0f), horizon, d_action, state);
   const auto high = processor.decode(chunk_of(1.0f), horizon, d_action, state);
-  if (!low || !high) return {};  // a chunk of equal values is no valid pose
+  if (!low || !high) return {};  // a chunk of equal values is not always a valid pose
   const std::vector<std::string>& names = processor.action_names();
   std::vector<std::string> constant;
   for (std::size_t column = 0; column < names.size(); ++column) {

@@ -35,15 +35,15 @@ class Tiff {
   bool little_;
 };
 
-/// Bytes per value of a TIFF type, 0 for types that the reference passes over.
+/// Bytes per value of a TIFF type, 0 for types that the reference skips.
 std::uint64_t type_size(std::uint32_t type) {
   constexpr std::uint8_t kSizes[] = {0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8};
   return type < std::size(kSizes) ? kSizes[type] : 0;
 }
 
-/// The first value of an integer entry; other types never compare equal to an orientation.
+/// The first value of an integer entry; none for other types, which the reference never takes for an orientation.
 std::optional<int> integer_at(const Tiff& tiff, std::uint64_t data, std::uint32_t type) {
-  const bool is_byte = type == 6;  // the unsigned byte, type 1, is a string to the reference
+  const bool is_byte = type == 6;  // the reference reads type 1, the unsigned byte, as a string
   const bool is_short = type == 3 || type == 8;
   const bool is_long = type == 4 || type == 9 || type == 13;
   if (!is_byte && !is_short && !is_long) return std::nullopt;
@@ -51,8 +51,8 @@ std::optional<int> integer_at(const Tiff& tiff, std::uint64_t data, std::uint32_
   return value && *value <= 8 ? static_cast<int>(*value) : 0;
 }
 
-/// Looks through the first directory, forgiving what the reference forgives: values that together would be larger than
-/// the file are passed over, one that points outside ends the search, and of several orientations the first counts.
+/// Searches the first directory and tolerates the same errors as the reference: it skips values that would make the
+/// total larger than the file, stops at a value outside the file, and returns the first of several orientations.
 std::optional<int> search_directory(const Tiff& tiff, std::uint64_t directory) {
   const std::uint32_t count = tiff.read(directory, 2).value_or(0);
   std::uint64_t total = 0;

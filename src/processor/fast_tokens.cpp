@@ -18,7 +18,8 @@ namespace {
 
 constexpr std::uint32_t kReplacement = 0xFFFD;
 
-/// How many bytes of damaged UTF-8 one replacement character stands for: the longest beginning of a character.
+/// The number of bytes of damaged UTF-8 that one replacement character replaces: the longest valid beginning of a
+/// character.
 std::size_t damaged_size(std::string_view text) {
   const auto is_in = [text](std::size_t i, unsigned low, unsigned high) {
     const unsigned byte = i < text.size() ? static_cast<unsigned char>(text[i]) : 0;
@@ -99,7 +100,8 @@ Status FastTokens::check(std::span<const std::int32_t> ids) const {
                fmt::format("{}", fmt::join(front, ", ")), "the policy did not answer with actions"};
 }
 
-/// Up to the first stop, without the prefix: after one is left out the search goes on behind it.
+/// The ids before the first stop token, without the occurrences of the prefix. The search continues after each
+/// occurrence.
 std::vector<std::int32_t> FastTokens::action_ids(std::span<const std::int32_t> ids) const {
   ids = ids.first(static_cast<std::size_t>(std::find(ids.begin(), ids.end(), stop_token_) - ids.begin()));
   std::vector<std::int32_t> kept;
@@ -112,8 +114,8 @@ std::vector<std::int32_t> FastTokens::action_ids(std::span<const std::int32_t> i
   return kept;
 }
 
-/// Those of the characters that the tokens' bytes make together, divided by the scale. The reference passes over ids
-/// behind FAST's last token, and makes a chunk of zeros where one stands in front of its first.
+/// Joins the tokens' bytes, decodes them to characters, and converts each character to a coefficient. As in the
+/// reference, ids after FAST's last token are skipped, and an id before its first token makes the whole chunk zeros.
 std::vector<double> FastTokens::coefficients(std::span<const std::int32_t> ids, std::string& note) const {
   std::string bytes;
   for (const std::int32_t id : ids) {

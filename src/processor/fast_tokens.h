@@ -13,17 +13,17 @@
 
 namespace vla {
 
-/// FAST: a language model's tokens as the discrete cosine transform of a chunk. A token stands for some characters, a
-/// character for a coefficient. Source: lerobot policies/pi0_fast/modeling_pi0_fast.py (detokenize_actions), tokenizers
-/// decoders/byte_level.
+/// FAST: a language model's tokens encode the discrete cosine transform of a chunk. A token is a string of characters,
+/// and each character is one coefficient. Source: lerobot policies/pi0_fast/modeling_pi0_fast.py (detokenize_actions),
+/// tokenizers decoders/byte_level.
 class FastTokens {
  public:
   /// Reads `action_tokens.*`, `solver.stop_token` and `lm.n_vocab`. Errors: bad_bundle.
   static Result<FastTokens> read(const Keys& keys);
 
-  /// The chunk (horizon, d_action), normalized, of the ids that the language model gave, in order. A chunk without all
-  /// of its coefficients has zeros for the rest; `note` then says so. Errors: bad_action, for a sequence that does not
-  /// begin as it must, and for an id that is none of the language model's.
+  /// Decodes the ids of the language model's answer, in order, to a normalized chunk (horizon, d_action). Missing
+  /// coefficients are zeros; `note` then says so. Errors: bad_action for a sequence that does not begin with the
+  /// required ids, or an id outside the language model's vocabulary.
   Result<std::vector<float>> decode(std::span<const std::int32_t> ids, int horizon, int d_action,
                                     std::string* note) const;
 
@@ -32,12 +32,12 @@ class FastTokens {
   std::vector<std::int32_t> action_ids(std::span<const std::int32_t> ids) const;
   std::vector<double> coefficients(std::span<const std::int32_t> ids, std::string& note) const;
 
-  std::vector<std::string> bytes_;  // that each of FAST's tokens stands for
+  std::vector<std::string> bytes_;  // the bytes of each FAST token
   double min_token_ = 0, scale_ = 1;
-  int first_id_ = 0;  // the language model's id of FAST's token 0; those of the others go down from here
+  int first_id_ = 0;  // the language model's id of FAST token 0; token i has the id first_id_ - i
   int stop_token_ = 0, n_vocab_ = 0;
-  std::vector<int> prefix_;    // ids of the text in front of actions, left out wherever it stands
-  std::vector<int> required_;  // ids that come first
+  std::vector<int> prefix_;    // ids of the text before the actions, removed wherever it occurs
+  std::vector<int> required_;  // ids with which the answer must begin
 };
 
 }  // namespace vla

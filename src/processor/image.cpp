@@ -22,11 +22,11 @@ constexpr std::int64_t kMaxSide = 1 << 14;
 Status check_size(std::int64_t width, std::int64_t height, const std::string& where, const ImageLimits& limits) {
   const std::string found = fmt::format("{} x {}", width, height);
   if (width < 1 || height < 1) return refused(where, "an image with at least one pixel", found);
-  // Divided, because the product of two hostile sizes may not fit.
+  // Divides, because the product of two hostile sizes may overflow.
   if (width > limits.max_pixels / height)
     return Error{limits.over, where, fmt::format("at most {} pixels", limits.max_pixels), found,
                  "scale the image down"};
-  // A row costs time of its own, however short it is, and padding makes a square of a line.
+  // Each row has a fixed cost, however short it is, and padding turns a single line into a square.
   if (std::max(width, height) > kMaxSide)
     return Error{limits.over, where, fmt::format("sides of at most {} pixels", kMaxSide), found,
                  "scale the image down"};

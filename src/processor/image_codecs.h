@@ -32,13 +32,13 @@ Status check_size(std::int64_t width, std::int64_t height, const std::string& wh
 /// The size of a PNG or JPEG file's image, and the work of decoding it, from its header.
 struct ImageHeader {
   int width = 0, height = 0;
-  std::int64_t work = 0;  // of decoding, counted in pixels of about 10 ns
+  std::int64_t work = 0;  // work of decoding, in units of about 10 ns (one pixel)
 };
 
-/// Reads no more than the header and the places of scans. Errors: those of `decode_image` that a header shows.
+/// Reads only the header and the positions of scans. Errors: those of `decode_image` that a header shows.
 Result<ImageHeader> read_header(Bytes file, const std::string& where, const ImageLimits& limits);
 
-/// Why no camera gives such a frame, if none does: all of its pixels are alike, or its bytes are 0 and 1.
+/// The reason why the frame cannot come from a camera, if there is one: all pixels are equal, or all bytes are 0 or 1.
 std::optional<std::string> suspicious(const Frame& frame);
 
 bool is_png(Bytes file);
@@ -48,12 +48,12 @@ Result<ImageHeader> jpeg_header(Bytes file, const std::string& where, const Imag
 Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits& limits);
 Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits);
 
-/// Pixels (height, width, 3) after a JPEG of this quality and 4:2:0, decoded by the fast integer DCT, as TensorFlow's
-/// encode_jpeg and decode_jpeg leave them. Throws std::bad_alloc.
+/// Encodes pixels (height, width, 3) as a JPEG of this quality with 4:2:0 subsampling and decodes it with the fast
+/// integer DCT, like TensorFlow's encode_jpeg and decode_jpeg. Throws std::bad_alloc.
 std::vector<std::uint8_t> through_jpeg(const std::vector<std::uint8_t>& rgb, int width, int height, int quality);
 
-/// The EXIF orientation, 1 to 8, or failing that the XMP one; 1 when neither says, or nothing that can be read. Source:
-/// Pillow Image.getexif, TiffImagePlugin ImageFileDirectory_v2.load.
+/// The EXIF orientation, 1 to 8, or if there is none the XMP orientation; 1 if there is neither, or no valid value.
+/// Source: Pillow Image.getexif, TiffImagePlugin ImageFileDirectory_v2.load.
 int orientation(std::span<const std::uint8_t> exif, const std::string& xmp);
 
 }  // namespace vla::codecs

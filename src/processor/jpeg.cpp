@@ -18,12 +18,13 @@
 namespace vla::codecs {
 namespace {
 
-/// Every scan passes over all pixels, and a scan may take no more than a few bytes of the file: what bounds the time is
-/// the product. It leaves ten scans, which is what progressive files have, to an image of 26 million pixels.
+/// Every scan passes over all pixels, even if it is only a few bytes of the file, so the product of scans and pixels is
+/// limited. An image of 26 million pixels may have ten scans, the usual number in progressive files.
 constexpr std::int64_t kMaxScans = 200, kMaxScanPixels = std::int64_t{1} << 28;
 
-/// libjpeg reports errors through a function that must not return; it jumps, which destroys nothing. So everything that
-/// owns memory lives here, outside the functions that a jump leaves, and those (`guarded_*`) hold only plain values.
+/// libjpeg reports errors through a function that must not return; `fail` uses longjmp, which runs no destructors. So
+/// everything that owns memory lives here, outside the functions that a jump leaves; those functions (`guarded_*`) hold
+/// only plain values.
 struct JpegReader {
   jpeg_decompress_struct jpeg{};
   jpeg_error_mgr errors{};
@@ -43,7 +44,7 @@ struct JpegReader {
   std::longjmp(reader->jump, 1);
 }
 
-/// Warnings (level -1) say that data was missing or wrong and something was made up instead.
+/// A warning (level -1) means that data is missing or wrong and that libjpeg replaces it.
 void on_message(j_common_ptr jpeg, int level) {
   if (level < 0) fail(jpeg);
 }
@@ -83,7 +84,7 @@ Markers read_markers(Bytes file) {
     const bool is_frame = marker >= 0xC0 && marker <= 0xCF && marker != 0xC4 && marker != 0xC8 && marker != 0xCC;
     if (is_frame && found.height == 0 && at + 8 < file.size())
       found.height = byte(at + 5) << 8 | byte(at + 6), found.width = byte(at + 7) << 8 | byte(at + 8);
-    const bool is_bare = marker <= 1 || (marker >= 0xD0 && marker <= 0xD8);  // a byte of a scan, a restart or a start
+    const bool is_bare = marker <= 1 || (marker >= 0xD0 && marker <= 0xD8);  // no length follows these markers
     at += 2;
     if (!is_bare && at + 1 < file.size()) at += std::max<std::size_t>(byte(at) << 8 | byte(at + 1), 2);
   }
@@ -97,10 +98,10 @@ Status check_scans(const Markers& found, const std::string& where) {
                  fmt::format("{} scans", found.n_scan), "save it as a baseline JPEG");
 }
 
-/// libjpeg makes up grey for what no scan brings, without a word.
+/// Whether the scans contain all data. libjpeg silently fills the rest with grey.
 bool is_whole(const jpeg_decompress_struct& jpeg) {
   for (int c = 0; c < jpeg.num_components; ++c) {
-    if (jpeg.comp_info[c].quant_table == nullptr) return false;  // of a component that no scan has
+    if (jpeg.comp_info[c].quant_table == nullptr) return false;  // no scan has this component
     const int* const missing_bits = jpeg.coef_bits != nullptr ? jpeg.coef_bits[c] : nullptr;
     if (missing_bits != nullptr && std::count(missing_bits, missing_bits + DCTSIZE2, 0) != DCTSIZE2) return false;
   }
@@ -151,7 +152,7 @@ Error corrupt(const JpegReader& reader, const std::string& where) {
 
 namespace {
 
-/// The file that an encoder writes. libjpeg frees and takes its memory itself.
+/// The file that the encoder writes, in memory that libjpeg allocates.
 struct JpegWriter {
   jpeg_compress_struct jpeg{};
   jpeg_error_mgr errors{};
@@ -188,7 +189,7 @@ bool guarded_encode(JpegWriter& writer, const std::uint8_t* rgb, int width, int 
   jpeg_start_compress(&writer.jpeg, TRUE);
   while (writer.jpeg.next_scanline < writer.jpeg.image_height) {
     const std::size_t row = std::size_t{writer.jpeg.next_scanline} * static_cast<std::size_t>(width) * 3;
-    auto* scanline = const_cast<JSAMPROW>(rgb + row);  // which libjpeg reads only
+    auto* scanline = const_cast<JSAMPROW>(rgb + row);  // libjpeg only reads it
     jpeg_write_scanlines(&writer.jpeg, &scanline, 1);
   }
   jpeg_finish_compress(&writer.jpeg);
@@ -213,7 +214,7 @@ bool is_jpeg(Bytes file) {
   return file.size() >= sizeof kStart && std::memcmp(file.data(), kStart, sizeof kStart) == 0;
 }
 
-/// A scan passes over all pixels and costs a quarter of the first; a byte of code costs as much as a pixel.
+/// Each scan after the first costs a quarter of the first; a byte of the file costs as much as a pixel.
 Result<ImageHeader> jpeg_header(Bytes file, const std::string& where, const ImageLimits& limits) {
   const Markers found = read_markers(file);
   VLA_CHECK(check_size(found.width, found.height, where, limits));
@@ -232,7 +233,7 @@ Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimit
   if (reader.jpeg.num_components != 1 && reader.jpeg.num_components != 3)
     return refused(where, "a grey or RGB JPEG",
                    reader.jpeg.num_components == 4 ? "a CMYK one" : "another number of channels", "convert it to RGB");
-  // Of an arithmetic code missing data cannot be told from zeros, and no camera writes it.
+  // With arithmetic coding, missing data cannot be distinguished from zeros. No camera uses it.
   if (reader.jpeg.arith_code) return refused(where, "a JPEG in Huffman code", "arithmetic code", "save it anew");
   const Markers found = read_markers(file);
   if (found.width != width || found.height != height) return refused(where, "a whole JPEG image", "one of two sizes");

@@ -109,7 +109,8 @@ void Merges::apply(const std::vector<std::int32_t>& word, std::vector<std::int32
     Symbol& left = at(top.left);
     if (left.merged_away || left.next < 0) continue;
     Symbol& right = at(left.next);
-    // The pair may have changed since it was queued. As in the reference, the token that it becomes now counts.
+    // The pair may have changed since it was queued. As in the reference, it is merged if the result is still the same
+    // token.
     const Merge* merge = find(left.id, right.id);
     if (merge == nullptr || merge->id != top.id) continue;
     right.merged_away = true;

@@ -11,7 +11,7 @@ namespace {
 
 constexpr std::size_t kChannels = 3;
 
-/// What the ops make of black, then of white, per channel.
+/// The results of the ops for black and for white, per channel.
 std::array<float, 2 * kChannels> ends_of(const Recipe& recipe, int view) {
   std::array<float, 2 * kChannels> ends = {0, 1, 0, 1, 0, 1};
   apply_ops(recipe, view, ends, 0, 2);

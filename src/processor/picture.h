@@ -6,8 +6,8 @@
 
 namespace vla {
 
-/// The planes that `Processor::encode_images` makes of a frame of this view, as an 8-bit picture for people. Values are
-/// scaled so that the recipe's results for black and white are black and white. Errors: bad_observation.
+/// An 8-bit picture, for people, of the planes that `Processor::encode_images` computes from a frame of this view.
+/// Values are scaled so that the recipe's results for black and white become black and white. Errors: bad_observation.
 Result<Frame> picture_of(const Processor& processor, const Frame& frame, int view);
 
 }  // namespace vla

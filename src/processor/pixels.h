@@ -10,15 +10,15 @@
 
 namespace vla {
 
-/// The pixels of an observation, in memory that a device may give. They keep it when filled again.
+/// The pixels of an observation, in memory that a device may provide. Refilling reuses the memory.
 class Pixels {
  public:
-  /// Memory for that many floats, or null where there is none: then it is the heap's.
+  /// Allocates `n` floats. If it returns null, the heap is used.
   using Source = std::function<std::shared_ptr<float[]>(std::size_t n)>;
 
-  /// For memory that is taken from now on.
+  /// Sets the source of all further allocations.
   void take_from(Source source) { source_ = std::move(source); }
-  /// Values are those before, or any.
+  /// The values are unspecified afterwards.
   void resize(std::size_t n) {
     if (n > capacity_) {
       memory_ = source_ ? source_(n) : nullptr;

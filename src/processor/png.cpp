@@ -16,7 +16,7 @@ namespace {
 
 constexpr std::string_view kSignature = "\x89PNG\r\n\x1A\n";
 
-/// libpng reports errors by longjmp, which destroys nothing. So everything that owns memory lives here, outside the
+/// libpng reports errors by longjmp, which runs no destructors. So everything that owns memory lives here, outside the
 /// functions that a jump leaves, and those functions (`guarded_*`) hold only plain values.
 struct PngReader {
   png_structp png = nullptr;
@@ -39,7 +39,7 @@ void on_error(png_structp png, png_const_charp message) {
   png_longjmp(png, 1);
 }
 
-// Nothing that libpng warns of reaches the pixels.
+// No warning of libpng concerns the pixels.
 void on_warning(png_structp, png_const_charp) {}
 
 void on_read(png_structp png, png_bytep data, std::size_t size) {
@@ -49,7 +49,7 @@ void on_read(png_structp png, png_bytep data, std::size_t size) {
   reader->position += size;
 }
 
-/// libpng's message for a damaged stream and for one without memory to unpack it may be the same.
+/// Records a failed allocation, because libpng may report it with the message for a damaged stream.
 png_voidp on_take(png_structp png, png_alloc_size_t size) {
   void* memory = std::malloc(size);
   if (memory == nullptr) static_cast<PngReader*>(png_get_mem_ptr(png))->lacked_memory = true;
@@ -69,14 +69,14 @@ bool open(PngReader& reader) {
 bool guarded_header(PngReader& reader) {
   if (setjmp(png_jmpbuf(reader.png)) != 0) return false;
   png_set_read_fn(reader.png, &reader, on_read);
-  png_set_user_limits(reader.png, PNG_UINT_31_MAX, PNG_UINT_31_MAX);  // `check_size` is the limit
-  // Texts, profiles and the like are passed over unread: libpng would unpack a thousand of them, of 8 MB each.
+  png_set_user_limits(reader.png, PNG_UINT_31_MAX, PNG_UINT_31_MAX);  // `check_size` limits the size
+  // Skips texts, profiles and other chunks, because libpng would unpack up to a thousand of them, of 8 MB each.
   png_set_keep_unknown_chunks(reader.png, PNG_HANDLE_CHUNK_NEVER, nullptr, -1);
   png_read_info(reader.png, reader.info);
   return true;
 }
 
-/// One byte per channel: three channels, or for a palette its index.
+/// Requests one byte per channel: three channels, or one index into a palette.
 bool guarded_layout(PngReader& reader) {
   if (setjmp(png_jmpbuf(reader.png)) != 0) return false;
   const int colour = png_get_color_type(reader.png, reader.info);
@@ -92,8 +92,8 @@ bool guarded_layout(PngReader& reader) {
   return true;
 }
 
-/// Memory for the pixels is reserved, and written as rows come: a file of few bytes cannot have all of it cleared. Each
-/// pass of an interlaced file needs all rows.
+/// `reader.pixels` has its memory reserved and grows as rows arrive, so that a file of a few bytes cannot cause all of
+/// it to be cleared. Each pass of an interlaced file needs all rows.
 bool guarded_pixels(PngReader& reader) {
   if (setjmp(png_jmpbuf(reader.png)) != 0) return false;
   const std::size_t row_size = png_get_rowbytes(reader.png, reader.info);
@@ -122,13 +122,13 @@ bool expand_palette(PngReader& reader) {
   return true;
 }
 
-/// The chunks of a file that tell how viewers are to turn an image.
+/// The chunks of a file that state the image's orientation.
 struct Orientation {
   Bytes exif;            // the last eXIf chunk
-  std::string_view xmp;  // the last XMP packet, with what stands before it
+  std::string_view xmp;  // the last XMP packet, with the fields before it in its chunk
 };
 
-/// Keeps an XMP packet. Nothing is unpacked to look for one.
+/// Keeps the chunk's XMP packet, if it has one. Compressed text is not unpacked.
 void read_text(std::string_view type, std::string_view content, Orientation& orientation) {
   if (type != "tEXt" && type != "iTXt") return;
   const std::string_view keyword = content.substr(0, content.find('\0'));
@@ -149,15 +149,15 @@ std::uint32_t number_at(Bytes file, std::size_t at) {
   return value;
 }
 
-/// Walks the chunks up to the end before libpng does: it would take memory for the length that a chunk states, up to
-/// 2 GiB, before it reads, and would go on without a chunk that is damaged.
+/// Checks all chunks before libpng reads them, because libpng allocates the length that a chunk states, up to 2 GiB,
+/// before it reads the chunk, and skips damaged chunks.
 Status walk(Bytes file, const std::string& where, Orientation& orientation) {
   const auto damaged = [&](const char* found) { return refused(where, "a whole PNG image", found); };
   constexpr std::size_t kAround = 12;  // length, type and checksum
   for (std::size_t at = kSignature.size(); file.size() - at >= kAround;) {
     const std::size_t length = number_at(file, at);
     if (length > file.size() - at - kAround) break;
-    const Bytes content = file.subspan(at + 4, length + 4);  // the type belongs to the checksum
+    const Bytes content = file.subspan(at + 4, length + 4);  // the checksum includes the type
     const auto checksum = crc32(0, reinterpret_cast<const Bytef*>(content.data()), static_cast<uInt>(content.size()));
     if (checksum != number_at(file, at + 8 + length)) return damaged("a chunk with another checksum");
     const std::string_view text(reinterpret_cast<const char*>(content.data()), content.size());
@@ -183,8 +183,8 @@ bool is_png(Bytes file) {
 }
 
 Result<ImageHeader> png_header(Bytes file, const std::string& where, const ImageLimits& limits) {
-  constexpr std::size_t kWidth = 16, kEnd = 33;  // of the IHDR chunk, which is the first
-  constexpr std::int64_t kWork = 3;              // rows of Paeth's filter
+  constexpr std::size_t kWidth = 16, kEnd = 33;  // places in the IHDR chunk, which comes first
+  constexpr std::int64_t kWork = 3;              // per pixel, for rows with Paeth's filter
   if (file.size() < kEnd) return refused(where, "a whole PNG image", "a truncated one");
   const std::int64_t width = number_at(file, kWidth), height = number_at(file, kWidth + 4);
   VLA_CHECK(check_size(width, height, where, limits));

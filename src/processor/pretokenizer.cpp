@@ -14,7 +14,7 @@ constexpr const char* kPreKey = "tokenizer.pre";
 constexpr std::size_t kMaxSteps = 8;  // no real tokenizer has more than two
 constexpr std::uint8_t kLetterNumberSpace = unicode::kLetter | unicode::kNumber | unicode::kSpace;
 
-/// The expression's class of a character; 0 is `[^\s\p{L}\p{N}]`.
+/// The class of a character in the splitting expressions; 0 is `[^\s\p{L}\p{N}]`.
 std::uint8_t kind(std::uint32_t code_point) {
   return static_cast<std::uint8_t>(unicode::classes(code_point) & kLetterNumberSpace);
 }
@@ -86,7 +86,7 @@ void split_digits(bool individual, std::string_view text, const OnPiece& on_piec
   if (start < text.size()) on_piece(text.substr(start));
 }
 
-/// `\s+(?!\S)|\s+`: of several white space characters before a word the last belongs to the word.
+/// `\s+(?!\S)|\s+`: the last of several white space characters before a word belongs to the word.
 std::size_t white_space(std::string_view text) {
   const std::size_t spaces = run(text, unicode::kSpace);
   if (spaces == text.size()) return spaces;
@@ -108,7 +108,7 @@ std::size_t gpt2_word(std::string_view text) {
 
 namespace {
 
-/// `n_digit`: the most numbers in one word.
+/// `n_digit`: the maximum number of digits in one word.
 std::size_t word_of(std::string_view text, int n_digit) {
   constexpr std::string_view kLineEnds = "\r\n";
   if (const std::size_t size = contraction_of_any_case(text)) return size;

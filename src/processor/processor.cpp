@@ -25,7 +25,8 @@ std::size_t first_bad(std::span<const float> values) {
   return static_cast<std::size_t>(found - values.begin());
 }
 
-/// Rows of a view that are prepared together: of 512 pixels, 196 KB, which a core's second cache keeps.
+/// Rows of a view that are preprocessed together. At 512 pixels per row they take 196 KB, which fits into a core's L2
+/// cache.
 constexpr int kBand = 32;
 
 std::size_t view_size(const Recipe& recipe) {
@@ -47,7 +48,7 @@ bool has_foreign_letter(std::string_view text) {
   return false;
 }
 
-/// Arranges what was given by name in the bundle's order; a null pointer where nothing was.
+/// Arranges values given by name in the bundle's order; null for a feature without a value.
 template <class T>
 Result<std::vector<const T*>> by_feature(const FeatureNames& features, const std::map<std::string, T>& given) {
   std::vector<const T*> ordered(features.names().size());
@@ -101,7 +102,7 @@ Status Processor::declare_absent(const std::string& view) {
 }
 
 Status Processor::encode_images(const Observation& observation, Inputs& inputs, const RunItems& run) const {
-  inputs.notes.clear();  // of the observation before: images come first
+  inputs.notes.clear();  // notes of the previous observation; images are encoded first
   VLA_TRY(const std::vector<PresentView> present, present_views(observation));
   inputs.n_view = static_cast<int>(present.size());
   inputs.views = 0;
@@ -134,7 +135,7 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs, 
   return {};
 }
 
-/// Rows of a view from the first op to the last, while they are in the caches. It may run on a thread that must not see
+/// Applies all image ops to some rows of a view while these are in the cache. It may run on a thread that must not see
 /// an exception.
 Status Processor::encode_rows(const Frame& frame, const std::string& name, int view, Rows rows,
                               std::span<float> out) const noexcept try {
@@ -175,12 +176,12 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
   if (!observation.text) return bad_observation("instruction", "a text", "none", "give an empty one if that is meant");
   const std::string& text = *observation.text;
   if (text.size() > Tokenizer::kMaxText || unicode::valid_prefix(text) < text.size())
-    return tokenizer_->encode(text).error();  // before anything reads it as characters
+    return tokenizer_->encode(text).error();  // checked before any op reads it as characters
   if (recipe_.discretizes_state && inputs.discretized_state.size() != n_state_)
     return Error{Code::internal, "instruction", "the state to be encoded before the text", "no state"};
   VLA_TRY(const std::string prompt, fill_prompt(text, inputs.discretized_state));
   if (text.empty()) inputs.notes.push_back("instruction: empty");
-  // The prompt of a full stop is that of an empty text, since punctuation is dropped.
+  // Punctuation is dropped, so a full stop has the same prompt as an empty text.
   if (recipe_.drops_punctuation && !text.empty() && prompt == *fill_prompt(".", inputs.discretized_state))
     return bad_observation("instruction", "a letter, digit or white space",
                            "nothing but punctuation, which is dropped");
@@ -211,7 +212,7 @@ Status Processor::check_view_places(std::span<const std::int32_t> tokens) const 
                          "the places of the views are made by the runtime; remove it from the text");
 }
 
-/// Keeps as many tokens as the recipe says. What stands around every text is not part of it and stays.
+/// Cuts the tokens to `limit`, at the end that the recipe states. The ids that stand before or after every text stay.
 void Processor::cut_tokens(std::vector<std::int32_t>& tokens, std::size_t limit) const {
   const std::size_t n_cut = tokens.size() - limit;
   const std::size_t first = recipe_.keep_last ? std::min(tokenizer_->prefix().size(), limit)
@@ -238,7 +239,7 @@ Status Processor::gather_states(const Observation& observation, std::vector<floa
   return {};
 }
 
-/// A value of the concatenated states, by feature and name.
+/// Names value i of the concatenated states by its feature and its own name.
 std::string Processor::state_place(std::size_t i) const {
   std::size_t first = 0, feature = 0;
   for (; i - first >= static_cast<std::size_t>(state_dims_[feature]); ++feature)
@@ -246,7 +247,7 @@ std::string Processor::state_place(std::size_t i) const {
   return fmt::format("{}[{}] (\"{}\")", states_.names()[feature], i - first, state_names_[i]);
 }
 
-/// Adds a note, or refuses, where normalized state values are far outside the training range.
+/// Adds a note, or refuses the observation, if normalized state values are far outside the training range.
 Status Processor::check_bound(const StateOp& op, bool reject, Inputs& inputs) const {
   std::vector<std::size_t> beyond;
   for (std::size_t i = 0; i < inputs.state.size(); ++i)
@@ -308,7 +309,8 @@ Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int h
     if (const std::size_t bad = first_bad(std::span(actions).last(width)); bad < width)
       return Error{Code::bad_action, fmt::format("actions[{}][\"{}\"]", i, action_names_[bad]), "a finite number",
                    fmt::format("{}", row[bad])};
-    // Ops that choose, such as a gripper's threshold, make a number of anything. Padded columns do not matter.
+    // Ops such as a gripper's threshold can turn NaN into a number, so the network's values are checked, too. Padded
+    // columns do not matter.
     if (const std::size_t n = std::min(width, numbers.size()), bad = first_bad(numbers.first(n)); bad < n)
       return Error{Code::bad_action, fmt::format("actions[{}]", i), "finite numbers of the network",
                    fmt::format("{} in column {}", numbers[bad], bad)};

@@ -22,31 +22,32 @@
 
 namespace vla {
 
-/// An observation, by name: see `FeatureNames` for the names that are understood.
+/// An observation, by name; `FeatureNames` describes the accepted names.
 struct Observation {
   std::map<std::string, std::optional<Frame>> views;  // nullopt: declared absent
   std::map<std::string, std::vector<float>> states;   // world units
   std::optional<std::string> text = {};               // the instruction, UTF-8, which may be empty; nullopt: not given
-  std::string embodiment = {};                        // the robot's tag; empty where the policy is for one
+  std::string embodiment = {};                        // the robot's tag; empty if the policy is for one robot
   bool reject_out_of_range = false;  // refuse a state or leftover beyond its bound, instead of a note in the answer
 };
 
-/// The host side of one observation, as the network reads it. Vectors keep their memory when filled again.
+/// One observation as the network reads it, encoded by the host. Vectors keep their memory when refilled.
 struct Inputs {
   int n_view = 0;
   std::uint64_t views = 0;  // bit i: view i of the bundle's order is present
   int height = 0, width = 0;
   Pixels pixels;                       // (n_view, 3, height, width), present views only, in the bundle's order
   std::vector<std::int32_t> tokens;    // at most `recipe().max_tokens`
-  std::vector<float> state;            // normalized, padded; empty where the network sees none
-  std::vector<int> discretized_state;  // where the prompt has a place for it
-  std::vector<float> raw_state;        // before its normalization, which actions may be relative to
-  bool out_of_range = false;           // the state has a value beyond the bundle's bound, as a note says
+  std::vector<float> state;            // normalized, padded; empty if the network reads none
+  std::vector<int> discretized_state;  // only if the prompt contains the state
+  std::vector<float> raw_state;        // the state before normalization; actions may be relative to it
+  bool out_of_range = false;           // state or leftover has a value beyond its bound; a note names it
   std::vector<std::string> notes;      // warnings, e.g. that the instruction was truncated
 };
 
-/// The bound of a normalized action, and the default one of a normalized state value, beyond which an answer has a
-/// note: ten standard deviations, or five times the range of the training data. Degrees in place of radians exceed it.
+/// An answer has a note if a normalized action exceeds this bound, or a normalized state value the bundle's bound, for
+/// which this is the default. The bound is ten standard deviations, or five times the range of the training data.
+/// Degrees in place of radians exceed it.
 inline constexpr double kStateBound = 10.0;
 
 /// Calls `item` with each number below `n`, in any order and on any threads.
@@ -65,7 +66,7 @@ class Processor {
   /// `lm.n_vocab`; null makes one.
   static Result<Processor> create(const Bundle& bundle, std::shared_ptr<const Tokenizer> tokenizer = nullptr);
 
-  /// All three parts below. Errors: bad_observation.
+  /// Calls the three functions below. Errors: bad_observation.
   Result<Inputs> encode(const Observation& observation) const;
 
   /// Each fills its own fields of `inputs`, and is timed on its own. A prompt may contain the state, so `encode_text`
@@ -77,8 +78,8 @@ class Processor {
   /// Pixels (3, height, width) of a black frame, which some references substitute for an absent view.
   std::vector<float> absent_view() const;
 
-  /// How many rows of a chunk of `horizon` rows are actions: all of them, or those that the recipe keeps, from
-  /// first_row() on.
+  /// The number of rows that are actions in a chunk of `horizon` rows: all of them, or those that the recipe keeps,
+  /// from first_row() on.
   int n_row(int horizon) const { return n_row_ > 0 ? n_row_ : horizon; }
   int first_row() const { return first_row_; }
 
@@ -86,36 +87,37 @@ class Processor {
   bool relative_actions() const { return relative_actions_; }
 
   /// chunk (horizon, d_action), normalized -> (n_row(horizon), action_names().size()) in world units.
-  /// `raw_state` is that of the chunk's observation. Errors: bad_action for a number that is not
+  /// `raw_state`: Inputs::raw_state of the chunk's observation. Errors: bad_action for a number that is not
   /// finite, naming its row and column.
   Result<std::vector<float>> decode(std::span<const float> chunk, int horizon, int d_action,
                                     std::span<const float> raw_state) const;
 
-  /// Which value of normalized actions (n, action_names().size()) is farthest from the training data, where one is
-  /// beyond kStateBound: for a note or a refusal. Columns that have no statistics are not looked at.
+  /// Describes, for a note or an error, the value of normalized actions (n, action_names().size()) that exceeds
+  /// kStateBound the most; nullopt if none does. Ignores columns without statistics.
   std::optional<std::string> far_action(std::span<const float> rows) const;
 
   /// Whether a step of the recipe reads this tensor; any other statistics in a bundle are a mistake.
   bool reads(const std::string& tensor) const;
 
-  /// From now on the robot has no such view: observations need not mention it, and may not give it. Errors: usage, for
-  /// a name that is none of the views, and where fewer would be left than the policy needs.
+  /// Declares that the robot lacks this view: observations need not mention it and must not contain it. Errors: usage
+  /// if no view has this name, or if fewer views would be left than the policy needs.
   Status declare_absent(const std::string& view);
 
   const FeatureNames& views() const { return views_; }
-  /// Whether an observation may leave this view unmentioned, which declares it absent.
+  /// Whether an observation may omit this view, which declares it absent.
   bool is_optional(std::size_t view) const { return view_optional_[view] != 0; }
   bool is_absent(std::size_t view) const { return view_absent_[view]; }
   int min_views() const { return min_views_; }
   const FeatureNames& states() const { return states_; }
   const std::vector<int>& state_dims() const { return state_dims_; }
   const std::vector<std::string>& action_names() const { return action_names_; }
-  /// Tokens that every prompt has around its places for views; 0 where the text has no such places.
+  /// The number of tokens that every prompt shares, from its start to the last place of a view, or from the first place
+  /// to its end; 0 if the text has no places for views.
   int n_view_tokens() const { return static_cast<int>(view_tokens_.size()); }
   const Recipe& recipe() const { return recipe_; }
-  /// Null where the policy reads no instruction.
+  /// Null if the policy reads no instruction.
   const std::shared_ptr<const Tokenizer>& tokenizer() const { return tokenizer_; }
-  /// Where the network answers with tokens that are decoded to a chunk.
+  /// Set if the network answers with tokens, which are decoded to a chunk.
   const std::optional<ActionTokens>& action_tokens() const { return action_tokens_; }
   /// Features that --identity-stats left unnormalized, which every answer reports.
   const std::vector<std::string>& degraded() const { return degraded_; }
@@ -143,8 +145,8 @@ class Processor {
   Status gather_states(const Observation& observation, std::vector<float>& state) const;
 
   FeatureNames views_, states_;
-  std::vector<int> view_optional_;  // per view 1 where it may be left unmentioned
-  std::vector<bool> view_absent_;   // of this robot
+  std::vector<int> view_optional_;  // 1 for each view that an observation may omit
+  std::vector<bool> view_absent_;   // views that this robot lacks
   int min_views_ = 0;
   std::vector<int> state_dims_;
   std::vector<std::string> state_names_, action_names_, degraded_;
@@ -153,15 +155,15 @@ class Processor {
   std::shared_ptr<const Tokenizer> tokenizer_;
   std::optional<ActionTokens> action_tokens_;
   /// If the text has places for views: the tokens of every prompt up to the last place, or from the first place on,
-  /// and the token of a place.
+  /// and the token that fills a place.
   std::vector<std::int32_t> view_tokens_;
   bool views_behind_ = false;
   std::int32_t view_token_ = -1;
   std::string view_token_text_;
   std::size_t n_state_ = 0;  // values of all states together
-  int d_action_ = 0;         // of the network
+  int d_action_ = 0;         // columns of the network's chunk
   int first_row_ = 0;
-  int n_row_ = 0;  // that the recipe keeps; 0: all
+  int n_row_ = 0;  // rows that the recipe keeps; 0: all
   bool relative_actions_ = false;
 };
 

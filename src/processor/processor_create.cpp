@@ -37,7 +37,7 @@ struct Run {
   int start, size;
 };
 
-/// Runs of `token`, of `longest` tokens at most: the next one begins another run.
+/// Finds runs of `token`. A run has at most `longest` tokens; the next token begins another run.
 std::vector<Run> runs_of(std::int32_t token, std::span<const std::int32_t> tokens, int longest) {
   std::vector<Run> runs;
   for (std::size_t i = 0; i < tokens.size(); ++i) {
@@ -164,7 +164,8 @@ Status Processor::read_degraded(const Keys& keys) {
   return {};
 }
 
-/// The prompt of an empty instruction shows where the places are; nothing that follows them may move them.
+/// Finds the places of the views in the prompt of an empty instruction. `check_view_places` refuses instructions that
+/// change them.
 Status Processor::read_view_places(const Keys& keys) {
   const ViewsOp* const views = recipe_.views;
   if (views == nullptr) return {};

@@ -16,15 +16,16 @@ bool is_space(std::uint32_t code_point);
 /// str.isalnum().
 bool is_alnum(std::uint32_t code_point);
 
-/// str.lower() for valid UTF-8: the dotted capital I becomes two characters, and a sigma at a word's end the final
-/// form.
+/// str.lower() for valid UTF-8: the dotted capital I becomes two characters, and a sigma at the end of a word becomes
+/// the final form.
 std::string lower(std::string_view text);
 
 /// Removes everything from valid UTF-8 that is neither alphanumeric nor white space nor an underscore, like
 /// re.sub(r"[^\w\s]", "", text).
 std::string drop_punctuation(std::string_view text);
 
-/// str([text]) of valid UTF-8: the text between brackets and quotes, with escapes for what is not printable.
+/// str([text]) of valid UTF-8: the text between brackets and quotes, with escapes for characters that are not
+/// printable.
 std::string list_of(std::string_view text);
 
 }  // namespace vla::python

@@ -22,7 +22,7 @@ namespace {
 
 constexpr const char* kRecipeKey = "processor.recipe";
 constexpr std::array<const char*, 4> kLists = {"image", "text", "state", "action"};
-constexpr std::size_t kMaxOps = 64;  // of one list
+constexpr std::size_t kMaxOps = 64;  // in one list
 
 const Ops& all_ops() {
   static const Ops ops = [] {
@@ -85,7 +85,7 @@ std::vector<int> Recipe::text_limits() const {
 
 namespace {
 
-/// Of a policy without views.
+/// The fit of a policy without views, which refuses every frame.
 struct NoImages final : Fit {
   const char* described() const override { return "none"; }
   Status apply(const Frame&, int, std::span<float>, const std::string& where) const override {

@@ -19,7 +19,7 @@ struct Windows {
   std::vector<Window> list;
 };
 
-/// A filter as a function of the distance, which reaches `support` far, and whether it is torch's.
+/// A filter: its weight as a function of the distance, which is 0 from `support` on, and whether it is torch's.
 struct Filter {
   double (*weight)(double);
   double support;
@@ -79,8 +79,8 @@ Windows make_windows(int n_in, int n_out, const Filter& filter) {
   return windows;
 }
 
-/// Resamples `n_line` lines. Positions are `step` bytes apart, lines `line_step` apart, with three channels at each
-/// position.
+/// The layout of `n_line` lines. Positions are `step` bytes apart and have three channels; lines are `line_step` bytes
+/// apart.
 struct Layout {
   int n_line;
   std::size_t step, line_step;

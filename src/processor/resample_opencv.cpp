@@ -16,8 +16,8 @@ struct Tap {
   int low_weight, high_weight;
 };
 
-/// `columns`: a position outside of the image takes the edge pixel only. Rows blend the edge row with itself, which
-/// sometimes changes the last digit.
+/// `columns`: a position outside of the image takes only the edge pixel. Rows blend the edge row with itself, which
+/// sometimes changes the last bit.
 std::vector<Tap> make_taps(int n_in, int n_out, bool columns) {
   const double scale = 1.0 / (static_cast<double>(n_out) / n_in);
   std::vector<Tap> taps;
@@ -34,7 +34,7 @@ std::vector<Tap> make_taps(int n_in, int n_out, bool columns) {
   return taps;
 }
 
-/// The same for INTER_AREA when an image grows: an output position inside one source position takes it alone.
+/// The same for INTER_AREA when an image grows: an output position inside one source position takes only that one.
 std::vector<Tap> make_area_taps(int n_in, int n_out) {
   const double inverse = static_cast<double>(n_out) / n_in, scale = 1.0 / inverse;
   std::vector<Tap> taps;
@@ -94,7 +94,7 @@ std::vector<std::uint8_t> blend(std::span<const std::uint8_t> rgb, int width, co
   return out;
 }
 
-/// Blocks of whole pixels.
+/// Averages blocks of whole pixels.
 std::vector<std::uint8_t> pooled(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                  int to_height) {
   const auto n_row = static_cast<std::size_t>(height / to_height),
@@ -118,7 +118,7 @@ std::vector<std::uint8_t> pooled(std::span<const std::uint8_t> rgb, int width, i
   return out;
 }
 
-/// A source position that lies partly or wholly in an output position.
+/// A source position that lies partly or wholly in an output position, with its weight there.
 struct Share {
   int to, from;
   float weight;
@@ -140,7 +140,7 @@ std::vector<Share> make_cells(int n_in, int n_out) {
   return cells;
 }
 
-/// Output cells that cut through pixels: float32 sums, first along rows, then along columns.
+/// Averages output cells whose borders cut through pixels: float32 sums, first along rows, then along columns.
 std::vector<std::uint8_t> averaged(std::span<const std::uint8_t> rgb, int width, const std::vector<Share>& columns,
                                    const std::vector<Share>& rows) {
   const auto in_row = static_cast<std::size_t>(width) * 3;

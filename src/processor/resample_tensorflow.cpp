@@ -10,7 +10,7 @@ namespace {
 
 constexpr float kRadius = 3.0f;
 
-/// x >= 0. Every product and quotient is rounded to float32, in the reference's order.
+/// For x >= 0. Every product and quotient is rounded to float32, in the reference's order.
 float lanczos3(float x) {
   constexpr float kPi = 3.14159265359f;
   if (x > kRadius) return 0.0f;
@@ -47,7 +47,7 @@ std::vector<Window> make_windows(int n_in, int n_out) {
   return windows;
 }
 
-/// Sums a line: calls `line` with each source position and weight.
+/// Calls `line` with each source position of the window and its weight.
 template <class Line>
 void each_weight(const Window& window, Line line) {
   for (std::size_t k = 0; k < window.weights.size(); ++k)

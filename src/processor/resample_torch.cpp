@@ -75,8 +75,8 @@ inline __attribute__((always_inline)) void add_row(std::span<const float> x, flo
   }
 }
 
-/// Sums several rows into one. torch's compiler computes the first product alone, then four products at once which it
-/// adds one by one; the remaining products are fused.
+/// Sums several rows into one. torch's compiler computes the first product alone, then groups of four products, which
+/// it adds one by one; the remaining products are fused.
 inline __attribute__((always_inline)) void sum_of_rows(std::span<const float> in, const Window& window,
                                                        std::span<float> out) {
   const std::size_t n_plain = (window.weights.size() - 1) / 4 * 4;
@@ -87,7 +87,7 @@ inline __attribute__((always_inline)) void sum_of_rows(std::span<const float> in
   }
 }
 
-// As in the letterbox: std::fma is equal on all machines, and slow without the instruction.
+// std::fma gives the same result on all machines but is slow without the instruction (see ops/letterbox.cpp).
 #if defined(__x86_64__)
 __attribute__((target("fma"))) void sum_of_rows_fused(std::span<const float> in, const Window& window,
                                                       std::span<float> out) {

@@ -15,7 +15,8 @@ namespace vla {
 
 class JsonFields;
 
-/// Interleaved 8-bit pixels, interleaved floats, or a frame of either kind into planes (3, to_height, to_width).
+/// Functions that resize interleaved 8-bit pixels, interleaved floats, or a frame of either kind; the last kind writes
+/// planes (3, to_height, to_width).
 using ResizeBytes = std::vector<std::uint8_t> (*)(std::span<const std::uint8_t> rgb, int width, int height,
                                                   int to_width, int to_height);
 using ResizeFloats = std::vector<float> (*)(std::vector<float> rgb, int width, int height, int to_width, int to_height);
@@ -23,16 +24,16 @@ using ResizeToPlanes = void (*)(const Frame& frame, int to_width, int to_height,
 
 /// A value of a recipe's field "filter".
 struct ResizeFilter {
-  const char* op;    // which takes it
-  const char* name;  // in the recipe
+  const char* op;    // the op that takes the filter
+  const char* name;  // the filter's name in the recipe
   std::variant<ResizeBytes, ResizeFloats, ResizeToPlanes> resize;
-  bool cuts_floats = false;  // a filter on bytes that takes float pixels too: 255 x, without rounding
+  bool cuts_floats = false;  // a filter on bytes that also takes float pixels: it truncates 255 x
 };
 
 /// The filter of that name, null if the op has none.
 const ResizeFilter* find_resize_filter(std::string_view op, std::string_view name);
 
-/// The field "filter" of an op. Errors: bad_bundle, with the op's filters.
+/// Reads the field "filter" of an op. Errors: bad_bundle, with the op's filters.
 Result<const ResizeFilter*> read_resize_filter(JsonFields& fields, std::string_view op);
 
 }  // namespace vla

@@ -35,7 +35,7 @@ Result<std::vector<std::int32_t>> read_around(const Keys& keys, const char* key,
   return Error{Code::bad_bundle, key, "at most " + std::to_string(kMaxAround) + " ids", std::to_string(ids.size())};
 }
 
-/// For each id whether it is an added token's.
+/// For each id, whether it belongs to an added token.
 std::vector<bool> are_added(const std::vector<AddedToken>& added, std::size_t n_token) {
   std::vector<bool> is_added(n_token);
   for (const AddedToken& token : added)
@@ -43,8 +43,9 @@ std::vector<bool> are_added(const std::vector<AddedToken>& added, std::size_t n_
   return is_added;
 }
 
-/// Adds the texts of added tokens to the list of tokens, so that it is complete. `whole_words`: a skipped single-word
-/// token could come back as a word of the model, and the bundle does not say whether the model's vocabulary has it.
+/// Checks that `tokens` has the text of each added token at its id. With `whole_words`, when whole words may become
+/// tokens, single-word tokens are refused: a skipped one could come back as a word of the model, and the bundle does
+/// not state whether the model's vocabulary has it.
 Status check_added(const std::vector<AddedToken>& added, const std::vector<std::string>& tokens, bool whole_words) {
   for (std::size_t i = 0; i < added.size(); ++i) {
     const std::string where = "tokenizer.added[" + std::to_string(i) + "]";
@@ -59,7 +60,7 @@ Status check_added(const std::vector<AddedToken>& added, const std::vector<std::
   return {};
 }
 
-/// Reads how text between added tokens is normalized.
+/// Reads the normalization of text between added tokens.
 Status read_normalization(const Keys& keys, Kind kind, AddedTokens::Normalize& normalize) {
   constexpr const char* kKey = "tokenizer.normalization";
   normalize = kind == Kind::byte_fallback ? ByteFallbackBpe::mark_blanks : nullptr;

@@ -80,7 +80,7 @@ std::string WordPiece::normalize(std::string_view text) {
 }
 
 void WordPiece::encode(std::string_view text, std::vector<std::int32_t>& ids) const {
-  std::size_t start = 0, at = 0;  // bytes of the word; bytes that are read
+  std::size_t start = 0, at = 0;  // start of the word; bytes read so far
   const auto end_word = [&] {
     if (at > start) encode_word(text.substr(start, at - start), ids);
   };

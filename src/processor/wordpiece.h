@@ -36,8 +36,8 @@ class WordPiece {
 
   void encode_word(std::string_view word, std::vector<std::int32_t>& ids) const;
 
-  Pieces heads_, tails_;     // tokens that begin a word; the others, without their mark
-  std::size_t longest_ = 0;  // longest of them, in bytes
+  Pieces heads_, tails_;     // tokens that begin a word; tokens inside a word, without `##`
+  std::size_t longest_ = 0;  // length of the longest token, in bytes
   std::int32_t unknown_ = 0;
 };
 

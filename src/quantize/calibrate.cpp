@@ -18,11 +18,11 @@ const char* name_of(Rounding codes) { return codes == Rounding::int4 ? "int4" : 
 /// A bundle that may be quantized, its codes, and how far they move the actions.
 struct Candidate {
   std::string bundle;
-  std::string files;  // its files: this and an ending
+  std::string files;  // prefix of the names of its files
   std::string codes = {};
-  bool by_hessians = false;  // whether codes of Hessians are better than plain ones
+  bool by_hessians = false;  // whether `codes` are by Hessians: better than plain codes
   Moved moved = {};
-  std::string told = {};  // about Hessians
+  std::string told = {};  // report line about Hessians
 };
 
 /// The steps of `calibrate` and their common state.
@@ -32,9 +32,10 @@ class Calibration {
               const EngineOptions& options, const std::function<void(QuantizeProgress)>& report)
       : from_(from), to_(to), observations_(observations), options_(options), report_(report), kept_{from, to} {}
 
-  /// Makes codes of three bundles and keeps the one whose codes move chunks least: as it is, with every channel divided
-  /// that stands out, and with these channels divided only in places where that helps by itself. Codes are those by
-  /// Hessians, since what these make good differs.
+  /// Makes codes of three bundles and keeps the one whose codes move the chunks least: the given bundle, one with every
+  /// outlier channel divided, and one with these channels divided only in places where that helps by itself. Each
+  /// bundle is judged with its better codes, plain or by Hessians, because Hessians compensate different errors in
+  /// each.
   Status smooth_channels(Rounding codes) {
     VLA_TRY(Smoothing found, find_smoothing(from_, observations_, options_));
     expected_ = std::move(found.chunks);
@@ -64,7 +65,7 @@ class Calibration {
     return {};
   }
 
-  /// Codes of what is kept, by Hessians.
+  /// Makes codes by Hessians for the kept bundle.
   Status round_kept_by_hessians(Rounding codes) {
     if (expected_.empty()) {
       EngineOptions float32 = options_;
@@ -92,7 +93,7 @@ class Calibration {
     if (candidate.bundle != from_) drop(candidate.bundle);
   }
 
-  /// Takes the codes of what is kept if they are by Hessians.
+  /// Adds the codes of the kept bundle to the result if they are by Hessians; else deletes them.
   void keep_codes() {
     take(kept_.told, kept_.by_hessians);
     if (kept_.by_hessians)
@@ -101,7 +102,7 @@ class Calibration {
       drop(kept_.codes);
   }
 
-  /// Makes plain codes and those that Hessians give, and keeps those that move chunks less.
+  /// Makes plain codes and codes by Hessians, and keeps those that move the chunks less.
   Status make_codes(Candidate& candidate, Rounding codes) {
     candidate.codes = candidate.files + ".codes";
     VLA_TRY(candidate.moved, moved_by(candidate.bundle, candidate.codes, codes, {}));
@@ -125,7 +126,7 @@ class Calibration {
 
   /// Writes codes of all matrices and returns how far they move the chunks.
   Result<Moved> moved_by(const std::string& bundle, const std::string& to, Rounding codes, const CodeSource& source) {
-    const auto report = source.feedback ? report_ : [](QuantizeProgress) {};  // plain codes take moments
+    const auto report = source.feedback ? report_ : [](QuantizeProgress) {};  // plain codes take only moments
     if (const auto made = quantize(bundle, to, all_as(codes), {}, report, source); !made) return made.error();
     VLA_TRY(const Chunks chunks, chunks_of(to, options_, observations_));
     return moved(expected_, chunks);
@@ -155,7 +156,7 @@ class Calibration {
   const std::span<const Judged> observations_;
   const EngineOptions& options_;
   const std::function<void(QuantizeProgress)>& report_;
-  Chunks expected_;  // in float32
+  Chunks expected_;  // chunks in float32
   Candidate kept_;
   Calibrated made_;
 };

@@ -37,7 +37,7 @@ Result<const std::byte*> CodeMaker::make(const std::byte* stored, std::int64_t f
   return static_cast<const std::byte*>(codes);
 }
 
-/// Copies the codes of a bundle that has them.
+/// Copies codes and scales from the bundle that has them.
 Result<const std::byte*> CodeMaker::copy(std::int64_t first, std::int64_t n, float* to) {
   const auto rows = [&](const std::string& tensor, std::size_t row) {
     return made_->find(tensor)->data.subspan(static_cast<std::size_t>(first) * row, static_cast<std::size_t>(n) * row);

@@ -8,7 +8,7 @@
 
 namespace vla {
 
-constexpr std::int64_t kPartRows = 64;  // of a matrix that are in memory at a time
+constexpr std::int64_t kPartRows = 64;  // rows of a matrix in memory at a time
 
 /// Makes the codes of a matrix, some rows at a time.
 class CodeMaker {

@@ -10,8 +10,8 @@
 namespace vla {
 namespace {
 
-constexpr std::int64_t kMaxRows = 128;  // rows kept of one value: tokens of an image are much alike
-constexpr double kDamping = 0.01;       // share of the columns' mean square that is added to all: GPTQ's percdamp
+constexpr std::int64_t kMaxRows = 128;  // rows used of one value: tokens of an image are much alike
+constexpr double kDamping = 0.01;       // fraction of H's mean diagonal, added to the diagonal: GPTQ's percdamp
 
 /// Calls f(first column, columns, offset of the stretch's matrix) for each stretch.
 template <class F>
@@ -29,14 +29,14 @@ double dot(const double* a, const double* b, std::int64_t n) {
   return sum;
 }
 
-/// Computes M of H = M Mᵀ, upper triangular, from H's upper triangle, from the last column to the first.
+/// Computes the upper triangular M with H = M Mᵀ from H's upper triangle, last column first.
 std::vector<double> factor(const float* h, std::int64_t n) {
   std::vector<double> m(static_cast<std::size_t>(n * n));
   double trace = 0;
   for (std::int64_t k = 0; k < n; ++k) trace += h[k * n + k];
   const double damping = kDamping * trace / static_cast<double>(n);
   for (std::int64_t k = n - 1; k >= 0; --k) {
-    const double* const right = &m[static_cast<std::size_t>(k * n + k + 1)];  // what is known of row k so far
+    const double* const right = &m[static_cast<std::size_t>(k * n + k + 1)];  // row k after the diagonal, known already
     const std::int64_t n_right = n - k - 1;
     const double square = h[k * n + k] + damping - dot(right, right, n_right);
     const double diagonal = std::sqrt(std::max(square, damping));

@@ -9,7 +9,7 @@
 namespace vla {
 namespace {
 
-/// Memory for Hessians at a time.
+/// Most bytes of Hessians that are measured at a time.
 std::size_t most_bytes(std::size_t budget) {
   constexpr std::size_t kMost = std::size_t{1} << 30;
   return budget > 0 ? std::min(kMost, budget / 4) : kMost;
@@ -29,7 +29,7 @@ Result<Hessians> Hessians::of(const std::string& bundle, std::span<const Judged>
   return hessians;
 }
 
-/// Null if not all of them are known.
+/// The paths of the values that a matrix multiplies; null if not all of them have one.
 const std::set<std::string>* Hessians::inputs_of(const Bundle& bundle, const TensorInfo& tensor) const {
   const auto found = inputs_.find(bundle.offset(tensor.data.data()));
   return found != inputs_.end() ? &found->second : nullptr;
@@ -48,7 +48,7 @@ Result<std::span<const float>> Hessians::feedback(const Bundle& bundle, const Te
 Status Hessians::measure(const Bundle& bundle, const TensorInfo& first) {
   feedback_.clear();
   std::map<std::set<std::string>, Hessian> sums;
-  std::multimap<std::string, Hessian*> readers;  // of a value
+  std::multimap<std::string, Hessian*> readers;  // Hessians by their value's path
   std::size_t size = 0;
   for (const TensorInfo& tensor : std::span(bundle.tensors()).subspan(&first - bundle.tensors().data())) {
     const std::set<std::string>* const paths = inputs_of(bundle, tensor);

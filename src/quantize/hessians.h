@@ -21,7 +21,7 @@ class Hessians {
   /// The compensation for a matrix, by its tensor's offset in the file; empty if a value that it multiplies has no
   /// path. Valid until the next call. Errors: those of Engine.
   Result<std::span<const float>> feedback(const Bundle& bundle, const TensorInfo& tensor);
-  /// How many of the matrices asked for had an answer, and how many were asked for.
+  /// For how many requested matrices a compensation is known, and how many were requested.
   int n_known() const { return n_known_; }
   int n_asked() const { return n_asked_; }
 

@@ -12,10 +12,10 @@
 namespace vla {
 namespace {
 
-constexpr std::int64_t kRows = 32;         // kept of a value
-constexpr std::int64_t kMatrixRows = 128;  // of a matrix that are multiplied with them
+constexpr std::int64_t kRows = 32;         // rows sampled from a value
+constexpr std::int64_t kMatrixRows = 128;  // rows of a matrix that multiply the sampled rows
 
-/// Bytes of rows in memory at a time.
+/// Most bytes of sampled rows in memory at a time.
 std::size_t most_sample_bytes(std::size_t budget) {
   constexpr std::size_t kMost = std::size_t{256} << 20;
   return budget > 0 ? std::min(kMost, budget / 8) : kMost;
@@ -48,7 +48,7 @@ class Sample {
 
 using Samples = std::map<std::string, Sample>;
 
-/// What a matrix multiplies where rows become int8: each is scaled by its largest element.
+/// Rows as int8 kernels read them: divided by `by`, if given, and rounded to int8 with one scale per row.
 std::vector<float> rounded(std::span<const float> rows, const std::vector<float>* by, std::size_t d) {
   std::vector<float> result(rows.begin(), rows.end());
   for (std::size_t first = 0; first < result.size(); first += d) {
@@ -152,7 +152,7 @@ class Judge {
   MatrixRows exact_, plain_, smoothed_;
 };
 
-/// Rows of as many of the scalings' values as fit in memory, of at least one.
+/// Samples rows of the scalings' values: of as many values as fit in memory, at least of one.
 Result<Samples> take_samples(const std::string& bundle, std::span<const Scaling> scalings,
                              std::span<const Judged> observations, EngineOptions options) {
   Samples samples;

@@ -11,9 +11,9 @@ struct CodedPair {
   std::string plain, smoothed;
 };
 
-/// Returns those scalings that help by themselves: with them, codes change the products of the matrices that read the
-/// value less. Rows of the value are taken from the acts of the observations, and rounded as the CPU's kernels of
-/// integers round them. `floats`: the bundle that the codes come from. `options`: of the engines. Errors: those of
+/// Returns the scalings that help by themselves: with them, codes cause smaller errors in the products of the matrices
+/// that read the value. Rows of the value are sampled in the acts of the observations and rounded as the CPU's int8
+/// kernels round them. `floats`: the bundle that the codes come from. `options` configure the engines. Errors: those of
 /// Engine.
 Result<std::vector<Scaling>> helpful_scalings(const std::string& floats, const CodedPair& coded, Rounding codes,
                                               std::span<const Scaling> scalings, std::span<const Judged> observations,

@@ -18,7 +18,8 @@
 namespace vla {
 namespace {
 
-/// Tensors of the file by the address of their bytes, which the robots of a bundle share.
+/// The tensors to quantize, by the address of their bytes, since the robots of a bundle share tensors. A tensor in
+/// `read_otherwise` stays as it is.
 struct Matrices {
   std::map<const std::byte*, Encoding> wanted;
   std::set<const std::byte*> read_otherwise;
@@ -124,7 +125,7 @@ class Writer {
   std::int64_t done_ = 0;
 };
 
-/// Codes and scales.
+/// Bytes of a matrix's codes and scales.
 std::int64_t quantized_size(const TensorInfo& tensor, const Encoding& encoding) {
   const std::size_t scales = static_cast<std::size_t>(tensor.shape[1]) * sizeof(float);
   return static_cast<std::int64_t>(encoding.size(tensor.count()) + scales);
@@ -142,7 +143,7 @@ std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& 
     codes.data = tensor.data.first(wanted->size(tensor.count()));
     codes.shape[0] = static_cast<std::int64_t>(dtype_size(wanted->type, codes.shape[0]));
     const std::int64_t d_out = tensor.shape[1];
-    // Every matrix row in a bundle has more bytes than a scale.
+    // The matrix's bytes serve as the scales' data, of which only the size is used: a row has more bytes than a scale.
     tensors.push_back(
         {scales_name(tensor.name, *wanted), DType::f32, {d_out}, tensor.data.first(dtype_size(DType::f32, d_out))});
   }

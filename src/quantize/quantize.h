@@ -41,19 +41,19 @@ struct Quantizable {
 /// none.
 Result<std::vector<Quantizable>> quantizable(const std::string& bundle);
 
-/// Where codes come from, if not from the matrix only.
+/// What codes are made from, besides the matrix itself.
 struct CodeSource {
   /// Returns the compensation for a matrix (hessian.h); empty if unknown. Called in file order.
   std::function<Result<std::span<const float>>(const Bundle& bundle, const TensorInfo& tensor)> feedback;
-  /// Bundles of the same policy whose codes are copied where they have the kind that is wanted.
+  /// Bundles of the same policy, whose codes are copied if they are of the wanted kind.
   std::vector<const Bundle*> made = {};
 };
 
 /// Writes a bundle whose large matrices are int8 or int4 codes with one scale per row. If all are of one kind, the
 /// codes are those that `--kernels int8` or `int4` makes at load, and the chunk is the same to the bit. Norms, biases,
-/// tables, matrices with fewer than 144 inputs or outputs (graph/rounding.h), and tensors that are also read otherwise
-/// stay as they are. `why` says what chose; the bundle keeps it as vla.quantization; it may be empty. Errors: those of
-/// `quantizable` and of `source`; unsupported if nothing is chosen; io.
+/// tables, matrices with fewer than 144 inputs or outputs (graph/rounding.h), and tensors that are also read
+/// unquantized stay as they are. `why`: how the codes were chosen; the bundle keeps it as vla.quantization, unless it
+/// is empty. Errors: those of `quantizable` and of `source`; unsupported if nothing is chosen; io.
 Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, const Choice& choice,
                                               const std::string& why,
                                               const std::function<void(QuantizeProgress)>& report,

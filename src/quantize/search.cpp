@@ -35,7 +35,7 @@ std::int64_t bytes_of(const Block& block) {
   return block.codes == Rounding::int4 ? block.int4 : block.codes == Rounding::int8 ? block.int8 : block.stored;
 }
 
-/// Squares, because the errors of blocks add in squares.
+/// Subtracts two errors as squares, because the errors of blocks add in squares.
 double beyond(double larger, double smaller) { return std::sqrt(std::max(0.0, larger * larger - smaller * smaller)); }
 
 class Search {
@@ -101,7 +101,7 @@ class Search {
     for (Block& block : blocks) block.codes = codes;
     return blocks;
   }
-  /// All in int8 but one.
+  /// Computes the error with all blocks in int8 but one.
   Result<Moved> with_one(std::size_t one, Rounding codes) {
     std::vector<Block> blocks = all(Rounding::int8);
     blocks[one].codes = codes;
@@ -140,7 +140,8 @@ class Search {
   }
   static void give_back(Block& block) { block.codes = block.codes == Rounding::int4 ? Rounding::int8 : Rounding::none; }
 
-  /// The block where the next larger codes reduce the error most per byte. Null if none is left.
+  /// The block for which the next larger codes reduce the error most per byte, among those that fit; null if none is
+  /// left.
   Result<Block*> next(const std::function<bool(const Block&)>& fits) {
     std::vector<Block*> candidates;
     for (Block& block : found_.blocks)
@@ -152,7 +153,7 @@ class Search {
     VLA_CHECK(measure_int8());
     return next(fits);
   }
-  /// Enlarges the codes of the best blocks until the expected error is at most `most`. Whether any block changed.
+  /// Enlarges the codes of the best blocks until the expected error is at most `most`. Returns whether any changed.
   Result<bool> give_back_until(double most) {
     for (bool given = false;; given = true) {
       VLA_TRY(Block* const block, next([](const Block&) { return true; }));

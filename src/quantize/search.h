@@ -29,10 +29,10 @@ Result<Chunks> chunks_of(const std::string& bundle, const EngineOptions& options
 std::string without_step(const std::string& path);
 Moved moved(const Chunks& expected, const Chunks& got);
 
-/// One of the two.
+/// The bound of a search: one of the two is set.
 struct Bound {
   std::optional<double> error;        // largest allowed Moved::rms
-  std::optional<std::int64_t> bytes;  // largest allowed file
+  std::optional<std::int64_t> bytes;  // largest allowed size of the file
 };
 
 /// The matrices of one block, or of a module without blocks. They get the same codes.
@@ -40,7 +40,7 @@ struct Block {
   std::string path;
   std::int64_t stored = 0, int8 = 0, int4 = 0;  // bytes
   double moved_by_int4 = 0;                     // Moved::rms above that of int8 if only this block is int4
-  double moved_by_int8 = 0;  // reduction of it if only this block stays unquantized; 0 if not measured
+  double moved_by_int8 = 0;  // reduction of Moved::rms if only this block stays unquantized; 0 if not measured
   Rounding codes = Rounding::int8;
 };
 
@@ -53,8 +53,8 @@ struct Found {
 /// Chooses int4, int8 or the stored floats for every block: the fewest bytes within the error bound, or the least error
 /// within the bytes. It measures each block as int4 alone, assumes that the errors of blocks add in squares, then
 /// measures the whole choice and adjusts it until the bound holds. `trial`: a temporary file, which is removed.
-/// `options`: of the engines; `source`: as in `quantize`. Errors: those of `quantize` and of Engine; unsupported if the
-/// bound cannot hold, with what can.
+/// `options` configure the engines; `source` is as in `quantize`. Errors: those of `quantize` and of Engine;
+/// unsupported if the bound cannot hold, with the closest bound that holds.
 Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,
                      const Bound& bound, const EngineOptions& options, const CodeSource& source,
                      const std::function<void(int trial, const Moved&)>& report);

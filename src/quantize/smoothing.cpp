@@ -18,8 +18,8 @@
 namespace vla {
 namespace {
 
-// Powers of two of a factor. Channels that stand out less are left, since weights of four bits lose more by a factor
-// than activations of eight gain.
+// Smallest and largest power of two of a factor. Smaller factors are not applied: weights of four bits would lose more
+// than activations of eight bits gain.
 constexpr int kLeastPower = 2, kMostPower = 12;
 
 /// The largest magnitude of each channel of a value over tokens, solver steps and observations.
@@ -31,7 +31,7 @@ void widen_range(std::vector<float>& range, std::size_t d, std::span<const float
     for (std::size_t k = 0; k < d; ++k) range[k] = std::max(range[k], std::abs(values[i + k]));
 }
 
-/// `chunks` receives the observations' chunks.
+/// Measures ranges over the observations; `chunks` receives their chunks.
 Result<Ranges> measure_ranges(const std::string& bundle, const std::vector<SmoothingPlace>& places,
                               std::span<const Judged> observations, EngineOptions options, Chunks& chunks) {
   Ranges ranges;
@@ -121,7 +121,7 @@ void multiply(std::vector<float>& factors, const std::vector<float>& by, bool in
   for (std::size_t i = 0; i < by.size(); ++i) factors[i] *= inverse ? 1 / by[i] : by[i];
 }
 
-/// Makes scalings of places. Parameters become tensors by their place in the file, since robots of a bundle share
+/// Makes scalings of places. A parameter's tensor is found by its offset in the file, since robots of a bundle share
 /// tensors.
 class Scalings {
  public:
@@ -155,7 +155,7 @@ class Scalings {
   std::map<std::ptrdiff_t, const TensorInfo*> by_offset_;
 };
 
-/// By the tensor's name.
+/// Returns the factors by tensor name.
 std::map<std::string, Factors> factors_of(std::span<const Scaling> scalings) {
   std::map<std::string, Factors> factors;
   for (const Scaling& scaling : scalings) {

@@ -43,7 +43,7 @@ const op::Linear* up_of(const Node& node, const Readers& readers) {
   return readers.at(&up).size() == 1 ? up.as<op::Linear>() : nullptr;
 }
 
-/// Dtypes that scaling by powers of two does not round.
+/// Whether scaling by powers of two is exact in the matrix's dtype.
 bool has_exponents(const Param& matrix) {
   return matrix.encoding.type == DType::f32 || matrix.encoding.type == DType::bf16;
 }
@@ -52,7 +52,7 @@ bool has_exponents(const Param& matrix) {
 
 void SmoothingPlaces::see(const Graph& graph) {
   const Readers readers = readers_of(graph);
-  std::map<const Node*, const Param*> read_from, rows_of;  // for products the weight of their place
+  std::map<const Node*, const Param*> read_from, rows_of;  // for each product, the weight of its place
   for (const Node& node : graph.nodes()) {
     SmoothingPlace place = {.path = node.path};
     if (node.as<op::Norm>() != nullptr && node.in.size() > 1) {

@@ -28,12 +28,12 @@ class SmoothingPlaces {
   std::vector<SmoothingPlace> found() const;
 
  private:
-  /// How operations use a parameter's elements: for each the weight of the place, null for other uses.
+  /// For each parameter, the places that use its elements, by the place's weight; null for other uses.
   using Uses = std::map<const Param*, std::set<const Param*>>;
 
   std::map<const Param*, SmoothingPlace> places_;  // by weight
-  std::set<const Param*> refused_;                 // weights
-  Uses columns_, rows_;                            // for matrices by place; for vectors only rows
+  std::set<const Param*> refused_;                 // weights of places that do not hold in some graph
+  Uses columns_, rows_;                            // uses of a matrix's columns and rows; vectors count as rows
 };
 
 }  // namespace vla

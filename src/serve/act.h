@@ -11,14 +11,14 @@
 
 namespace vla::serve {
 
-/// Limits of an act. They are checked before the memory that the sizes ask for is allocated.
+/// Limits of an act, checked before memory of the requested sizes is allocated.
 struct ActLimits {
-  std::int64_t max_pixels = 0;  // cost of all images: decoding and fitting
+  std::int64_t max_pixels = 0;  // budget of all images together: pixels to decode and to fit
   std::size_t max_text = 0;     // bytes
   std::size_t max_views = 0;
-  int horizon = 0;  // of the network's chunk
+  int horizon = 0;  // rows of the network's chunk
   int noise_rows = 0, d_noise = 0;
-  int d_action = 0;          // of a chunk
+  int d_action = 0;          // columns of a chunk
   const Fit* fit = nullptr;  // the recipe's image ops
 };
 
@@ -31,7 +31,7 @@ struct ActRequest {
   std::int64_t capture_time_ns = 0;
 };
 
-/// Errors: usage for a bundle of several robots, which clients of `option` cannot name.
+/// Checks that the bundle has one robot: clients of `option` cannot name one of several. Errors: usage.
 Status check_one_robot(const Engine& engine, const char* option);
 
 /// Limits for one robot's acts.

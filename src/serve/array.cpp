@@ -27,7 +27,8 @@ template <class T>
 T times_255(T value) {
   return T{255} * value;
 }
-/// Rounded to the eleven bits of a half, which cuts no number from 0 to 255 to another integer than its own arithmetic.
+/// Rounds the product to the 11 significant bits of a float16. For values in [0, 1], truncation then gives the same
+/// integer as float16 arithmetic.
 float times_255(Half value) {
   int exponent = 0;
   const float product = 255 * static_cast<float>(value);
@@ -35,7 +36,7 @@ float times_255(Half value) {
   return std::ldexp(std::nearbyint(std::ldexp(product, 11 - exponent)), exponent - 11);
 }
 
-/// 255 x cut to an integer.
+/// Multiplies by 255 and truncates to an integer. Errors: bad_observation for values outside [0, 1].
 template <class T>
 Status cut_to_bytes(const Elements<T>& elements, const std::string& where, std::vector<std::uint8_t>& out) {
   for (std::size_t i = 0; i < out.size(); ++i) {

@@ -25,7 +25,7 @@ class ElementType {
   std::size_t size() const { return size_; }  // bytes of an element, at least 1
   bool is_swapped() const { return order_ == '>' && size_ > 1; }
   bool is_text() const { return kind_ == 'U'; }
-  std::string name() const;  // as `read` takes it
+  std::string name() const;  // the type string, in the form that `read` accepts
 
  private:
   ElementType() = default;
@@ -33,12 +33,12 @@ class ElementType {
   std::size_t size_ = 1;
 };
 
-/// A NumPy array over the bytes of its message, in C order. It exists only where type and shape ask for exactly as many
-/// bytes as there are.
+/// A NumPy array over the bytes of its message, in C order. Type and shape always account for exactly these bytes.
 class Array {
  public:
   static constexpr std::size_t kMaxRank = 8;
-  /// Errors: bad_observation for more dimensions, a negative or overflowing size, and for fewer or more bytes.
+  /// Errors: bad_observation for more than kMaxRank dimensions, a negative or overflowing size, or a number of bytes
+  /// that does not fit type and shape.
   static Result<Array> make(ElementType type, std::vector<std::int64_t> shape, std::string_view data,
                             const std::string& where);
 
@@ -47,8 +47,8 @@ class Array {
   std::string_view data() const { return data_; }
   std::size_t count() const { return data_.size() / type_.size(); }  // elements
 
-  /// Calls `visit` with the elements in their own C++ type, as Elements<T>; a boolean is one where its byte is not 0.
-  /// Text has none: `visit` gets its bytes.
+  /// Calls `visit` with the elements in their C++ type, as Elements<T>. A boolean is true if its byte is not 0. Text is
+  /// passed as its bytes.
   template <class Visit>
   auto visit(Visit visit) const;
 
@@ -61,7 +61,7 @@ class Array {
   std::string_view data_;
 };
 
-/// A number of NumPy's float16, which is exact as a float.
+/// A NumPy float16. Its conversion to float is exact.
 struct Half {
   std::uint16_t bits;
   operator float() const {  // NOLINT: as the built-in types convert
@@ -91,15 +91,16 @@ struct Elements {
   }
 };
 
-/// The numbers of an array of one row, dimensions of one before it being dropped, as float32. Errors: bad_observation.
+/// Returns the numbers of a one-row array as float32; leading dimensions of one are dropped. Errors: bad_observation.
 Result<std::vector<float>> row_of(const Array& array, const std::string& where);
 
-/// A camera frame of (height, width, 3) or (3, height, width), dimensions of one before them being dropped: uint8, or
-/// float16, float32 or float64 in [0, 1], which become uint8 as the references make them, by 255 x in the array's own
-/// arithmetic and a cut. `is_bgr`: blue comes first. Errors: bad_observation, and `limits.over` for too many pixels.
+/// Reads a camera frame of shape (height, width, 3) or (3, height, width); leading dimensions of one are dropped.
+/// Elements are uint8, or float16, float32 or float64 in [0, 1]. Floats become uint8 as in the references: multiplied
+/// by 255 in the array's own precision, then truncated. `is_bgr`: blue comes first. Errors: bad_observation, and
+/// `limits.over` for too many pixels.
 Result<Frame> frame_of(const Array& array, const std::string& where, const ImageLimits& limits, bool is_bgr);
 
-/// The text of an array of one. Errors: bad_observation.
+/// Returns the text of an array with one element. Errors: bad_observation.
 Result<std::string> text_of(const Array& array, const std::string& where);
 
 template <class Visit>

@@ -63,7 +63,7 @@ ChunkLimits::ChunkLimits(const control::Limits& limits, double rate_hz, bool ref
   }
 }
 
-/// `12 of 50, from row 7 on: shoulder_pan (12), elbow (3)`
+/// For example `12 of 50, from row 7 on: shoulder_pan (12), elbow (3)`.
 std::string ChunkLimits::told(const ActionChunk& chunk, int n_beyond, int first) {
   std::vector<std::string> columns;
   std::vector<float> rows(static_cast<std::size_t>(chunk.horizon));

@@ -13,20 +13,22 @@
 
 namespace vla::serve {
 
-/// The limits that the options name, or none. Errors: usage, for a file that holds none.
+/// Reads the limits file that the options name; none if they name no file. Errors: usage, for an invalid file, or for
+/// --limits or --on-limit alone.
 Result<std::optional<control::Limits>> read_limits(const ServerOptions& options);
 
-/// What the rows of a robot's chunks may be: ranges, and the steps from one row to the next. Where the robot is when a
-/// row is commanded, and so the step to it, only its own loop knows. The thread that computes uses it.
+/// Limits on the rows of a robot's chunks: ranges, and the steps from one row to the next. The step from the robot's
+/// position to the first row is not checked: only the robot's own control loop knows that position. Only the computing
+/// thread uses it.
 class ChunkLimits {
  public:
-  /// `robot`: the description of one robot. Errors: usage, where columns or units are not those of the limits, or where
-  /// the bundle does not say the control rate that velocities need.
+  /// `robot`: the description of one robot. Errors: usage if columns or units differ from those of the limits, or if a
+  /// limit per second needs a control rate that the bundle does not state.
   static Result<ChunkLimits> of(const control::Limits& limits, const ServerOptions& options,
                                 const v1::Description& robot, const std::string& bundle);
 
-  /// Counts the rows that break a limit, and adds a note that says which columns do. Errors: bad_action, where
-  /// --on-limit refuses such rows, or more of them do than the limits permit.
+  /// Counts the rows that break a limit, and adds a note that names the columns. Errors: bad_action if --on-limit
+  /// refuses such rows, or if their share is larger than the limits permit.
   Status check(ActionChunk& chunk, int& n_beyond);
 
  private:
@@ -35,7 +37,7 @@ class ChunkLimits {
 
   std::vector<std::string> names_;
   control::Limiter all_;
-  std::vector<control::Limiter> each_;  // of one column
+  std::vector<control::Limiter> each_;  // one limiter for each column
   bool refuses_;
 };
 

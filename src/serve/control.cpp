@@ -29,11 +29,11 @@ namespace {
 using nlohmann::ordered_json;
 
 constexpr std::size_t kMaxLine = 64 << 10;
-constexpr std::size_t kMaxClients = 16;                    // whose orders are on their way
+constexpr std::size_t kMaxClients = 16;                    // clients whose orders are incomplete
 constexpr auto kPatience = std::chrono::seconds(5);        // from a connection to the end of its order
-constexpr auto kMoment = std::chrono::milliseconds(50);    // of it that a client has however many others connect
-constexpr timeval kReading = {.tv_sec = 2, .tv_usec = 0};  // for a client to take its answer
-constexpr int kLoadNice = 10;                              // loading gives way to the acts of the policies that answer
+constexpr auto kMoment = std::chrono::milliseconds(50);    // minimum for a client's order, however many others connect
+constexpr timeval kReading = {.tv_sec = 2, .tv_usec = 0};  // timeout for sending an answer
+constexpr int kLoadNice = 10;                              // loading yields the CPU to acts in progress
 
 Result<sockaddr_un> address_of(const std::string& path) {
   sockaddr_un address = {};
@@ -46,7 +46,8 @@ Result<sockaddr_un> address_of(const std::string& path) {
 
 Error failed(const std::string& path, const char* what) { return {Code::io, path, what, std::strerror(errno)}; }
 
-/// Appends what has come of a line, up to its end. Whether no more is to be waited for.
+/// Appends the received part of a line. Returns whether to stop reading: the line is complete or too long, the peer has
+/// closed, or an error occurred.
 bool read_some(int socket, std::string& line, int flags) {
   char bytes[4096];
   const ssize_t n = ::recv(socket, bytes, sizeof(bytes), flags);
@@ -114,11 +115,11 @@ Result<std::unique_ptr<Control>> Control::open(const std::string& path, Server& 
 Status Control::bind() {
   VLA_TRY(const sockaddr_un address, address_of(path_));
   VLA_CHECK(net::check_free("ipc://" + path_, "--control"));
-  ::unlink(path_.c_str());  // what is there is a socket that no process serves
+  ::unlink(path_.c_str());  // any socket at this path is stale: check_free found no server
   stopped_ = ::eventfd(0, EFD_CLOEXEC);
   listener_ = ::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
   if (stopped_ < 0 || listener_ < 0) return failed(path_, "a file descriptor");
-  // Before it has a name, so that nobody else can open it for a moment.
+  // Restricts the mode before the socket has a name, so that no other user can open it in between.
   if (::fchmod(listener_, S_IRUSR | S_IWUSR) != 0 ||
       ::bind(listener_, reinterpret_cast<const sockaddr*>(&address), sizeof(address)) != 0)
     return failed(path_, "a path that can be bound");
@@ -147,7 +148,7 @@ Control::~Control() {
 }
 
 void Control::run() {
-  ::setpriority(PRIO_PROCESS, 0, ::getpriority(PRIO_PROCESS, 0) + kLoadNice);  // of this thread, and those it starts
+  ::setpriority(PRIO_PROCESS, 0, ::getpriority(PRIO_PROCESS, 0) + kLoadNice);  // for this thread and those it starts
   std::list<Client> clients;
   for (;;) {
     const bool takes = has_room(clients);
@@ -167,12 +168,14 @@ void Control::run() {
   ended_.set_value();
 }
 
-/// Whether another client may come: the oldest, which would be refused for it, has had a moment to send its order.
+/// Whether another client may be accepted: a place is free, or the oldest client, which would lose its place, has had
+/// kMoment to send its order.
 bool Control::has_room(const std::list<Client>& clients) {
   return clients.size() < kMaxClients || Clock::now() >= clients.front().until - kPatience + kMoment;
 }
 
-/// Until the oldest client has had its time, or its moment where others wait for a place.
+/// Milliseconds until the oldest client's kPatience ends, or its kMoment if others wait for a place; -1 without
+/// clients.
 int Control::ms_left(const std::list<Client>& clients, bool takes) {
   if (clients.empty()) return -1;
   const auto until = clients.front().until - (takes ? Clock::duration(0) : kPatience - kMoment);
@@ -183,7 +186,7 @@ int Control::ms_left(const std::list<Client>& clients, bool takes) {
 void Control::accept(std::list<Client>& clients) {
   const int socket = ::accept4(listener_, nullptr, nullptr, SOCK_CLOEXEC);
   if (socket < 0) {
-    std::this_thread::sleep_for(std::chrono::milliseconds(100));  // without descriptors it would come back at once
+    std::this_thread::sleep_for(std::chrono::milliseconds(100));  // without descriptors, poll would return at once
     return;
   }
   ::setsockopt(socket, SOL_SOCKET, SO_SNDTIMEO, &kReading, sizeof(kReading));
@@ -194,12 +197,13 @@ void Control::accept(std::list<Client>& clients) {
     answer(clients.front()), clients.pop_front();
 }
 
-/// Answers what came of its order. An exception from a library fails this order, not the server.
+/// Answers a client by the part of its order that has arrived. An exception from a library fails this order, not the
+/// server.
 void Control::answer(Client& client) try {
   const std::unique_ptr<int, void (*)(int*)> closed(&client.socket,
                                                     [](int* open) { ::close(std::exchange(*open, -1)); });
   const std::string line = client.line.substr(0, client.line.find('\n'));
-  // Orders are flat. What lies deeper is not kept, since its values would take a hundred times their bytes.
+  // Orders are flat. Deeper values are dropped: once parsed, they would take a hundred times their bytes.
   const auto is_kept = [](int depth, ordered_json::parse_event_t, const ordered_json&) { return depth < 2; };
   const ordered_json given = ordered_json::parse(line, is_kept, false);
   try {
@@ -208,7 +212,7 @@ void Control::answer(Client& client) try {
   } catch (const std::bad_alloc&) {
     write_json(client.socket, refused(out_of_memory("order")));
   }
-} catch (const std::exception&) {  // not even for the refusal
+} catch (const std::exception&) {  // no memory even for the refusal
 }
 
 Result<ordered_json> Control::obey(const ordered_json& given) {

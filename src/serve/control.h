@@ -22,10 +22,10 @@ struct LoadedPolicy {
   double load_ms = 0, warm_up_ms = 0;
 };
 
-/// Orders to a server that runs, over a socket in the file system that only its own user can open. A client sends one
-/// line of JSON, {"do": "list"}, {"do": "load", "policy": NAME, "bundle": PATH}, {"do": "unload", "policy": NAME} or
-/// {"do": "drain"}, and gets one back when it is done, with "error" in it where it was refused. One order is obeyed at
-/// a time; a client that takes long to give its own keeps none of the others waiting.
+/// Takes orders to a running server over a Unix socket that only the server's user can open. A client sends one line of
+/// JSON, {"do": "list"}, {"do": "load", "policy": NAME, "bundle": PATH}, {"do": "unload", "policy": NAME} or {"do":
+/// "drain"}. It gets one line back when the order is done; the line contains "error" if the order was refused. Orders
+/// run one at a time. A client that sends its order slowly does not delay other clients.
 class Control {
  public:
   /// The parts of the program that an order needs or changes; called on the thread of Control.
@@ -34,18 +34,18 @@ class Control {
     std::function<void(const std::string& policy, const Engine& engine)> loaded;
     std::function<void(const std::string& policy)> unloaded;
   };
-  /// Binds the path. Everything outlives it. Errors: io, usage.
+  /// Binds the path. `server` and everything that `program` refers to must outlive the result. Errors: io, usage.
   static Result<std::unique_ptr<Control>> open(const std::string& path, Server& server, Program program);
-  /// Takes orders from now on.
+  /// Starts to accept orders.
   Status start();
-  /// Takes no orders any more. Whether the one that was being obeyed ended in this time: a bundle that is being loaded
-  /// cannot be told to stop.
+  /// Stops accepting orders. Returns whether the order in progress ended within `patience`: loading a bundle cannot be
+  /// interrupted.
   bool stop(std::chrono::milliseconds patience);
-  /// Waits for the order that is being obeyed.
+  /// Waits for the order in progress.
   ~Control();
 
  private:
-  /// One whose order has not come whole yet.
+  /// A client whose order has not arrived completely.
   struct Client {
     int socket;  // -1 once it is answered
     Clock::time_point until;
@@ -67,12 +67,12 @@ class Control {
   Server& server_;
   const Program program_;
   int listener_ = -1, stopped_ = -1;  // a socket, an eventfd
-  std::promise<void> ended_;          // of the thread
+  std::promise<void> ended_;          // set when the thread ends
   std::future<void> thread_ended_ = ended_.get_future();
   std::thread thread_;
 };
 
-/// Sends an order to the server at this path. Its answer. Errors: io, and those of the order.
+/// Sends an order to the server at this path and returns its answer. Errors: io, and those of the order.
 Result<nlohmann::ordered_json> order(const std::string& path, const nlohmann::ordered_json& given);
 
 }  // namespace vla::serve

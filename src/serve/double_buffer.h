@@ -23,7 +23,7 @@ class DoubleBuffer {
     return acts_[n_prepared_ % acts_.size()];
   }
   void prepared() { count(n_prepared_); }
-  /// Ends: no act is prepared afterwards.
+  /// Ends the exchange: no act is prepared afterwards.
   void close() {
     const std::lock_guard lock(mutex_);
     closed_ = true;

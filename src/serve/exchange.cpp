@@ -31,7 +31,7 @@ std::optional<Job> Exchange::next() {
     const auto deadline = jobs_.first_deadline();
     const bool has_late = deadline && *deadline <= now_();
     if (has_late) {
-      wake();  // the I/O thread drains it and returns
+      wake();  // the I/O thread takes the late job and notifies this thread
     } else if (!jobs_.empty() && !(jobs_.is_crowded() && n_taken_ > 0)) {
       ++n_taken_;
       return jobs_.pop();

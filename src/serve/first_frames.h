@@ -10,8 +10,8 @@
 
 namespace vla::serve {
 
-/// Writes what the policy sees of each frame as VIEW.png into a folder, which is made where it is not there. The files.
-/// Errors: bad_observation, io.
+/// Writes each frame as the policy sees it after preprocessing to VIEW.png in a folder, which is created if it is
+/// missing. Returns the files' paths. Errors: bad_observation, io.
 Result<std::vector<std::string>> save_first_frames(const Observation& observation, const Robot& robot,
                                                    const std::string& folder);
 

@@ -41,7 +41,7 @@ class Call {
   virtual Result<ActRequest> decode(const ServedPolicy& policy) = 0;
   /// Encodes the chunk. On the computing thread.
   virtual std::string encode(Reply reply, const ServedPolicy& policy) = 0;
-  /// Encodes a refusal. This and what follows run on the I/O thread.
+  /// Encodes a refusal. This function, `send` and `send_out_of_memory` run on the I/O thread.
   virtual std::string encode(const Error& error) = 0;
   /// Sends an answer, unless the client is gone or does not read.
   virtual void send(const std::string& answer) = 0;
@@ -57,12 +57,12 @@ struct Job : Received {
   std::string policy_name;                   // name that the client gave; empty for the only policy or the default
   std::shared_ptr<ServedPolicy> policy;      // the policy that answers, once it is queued
   net::Share share;                          // for fairness between peers
-  std::optional<std::uint64_t> deadline_ms;  // from receipt until it must be started
+  std::optional<std::uint64_t> deadline_ms;  // milliseconds from receipt within which it must start
   std::optional<Clock::time_point> deadline;
 };
 
 /// A protocol: it owns its listening sockets, answers what needs no engine, and passes calls to `Io::submit`. It knows
-/// no architecture; the description says what a policy takes.
+/// no architecture; the description lists a policy's inputs.
 class Front {
  public:
   virtual ~Front() = default;

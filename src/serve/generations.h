@@ -10,9 +10,9 @@
 
 namespace vla::serve {
 
-/// Splits connections into generations by their time of arrival: at gaps of a second or more, the widest ones if there
-/// are many. To share a robot's generation, a flood needs as many other gaps as wide as the one between the robot and
-/// itself.
+/// Splits connections into at most kMax generations by time of arrival, at the widest gaps of a second or more. A flood
+/// can join a robot's generation only if kMax - 1 other gaps are at least as wide as the gap between the robot and the
+/// flood.
 class Generations {
  public:
   static constexpr std::size_t kMax = 8;

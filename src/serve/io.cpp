@@ -11,7 +11,7 @@
 namespace vla::serve {
 namespace {
 
-constexpr auto kLinger = std::chrono::seconds(2);  // for the last answers on the way out
+constexpr auto kLinger = std::chrono::seconds(2);  // time to send the last answers before the thread ends
 constexpr std::uint64_t kMaxDeadlineMs = 86'400'000;
 constexpr int kTrimEvery = 5;  // seconds
 
@@ -25,7 +25,7 @@ void ServerState::begin() noexcept {
 }
 
 Health ServerState::health(const Exchange& exchange) const {
-  const Clock::rep since = ready_since;  // before `ready`, which begin() sets first: up and not ready is draining
+  const Clock::rep since = ready_since;  // before `ready`, which begin() sets first: uptime without `ready` is draining
   const Clock::duration up = Clock::now().time_since_epoch() - Clock::duration(since);
   return {ready,
           exchange.n_waiting(),
@@ -69,7 +69,7 @@ void Io::wait(std::optional<Clock::time_point> until) {
       exchange_.fd(), until);
 }
 
-/// What a flood of acts took lies between what is in use, where malloc keeps it.
+/// Returns memory to the system: after a flood of acts, malloc keeps freed blocks between blocks in use.
 void Io::sweep() {
   if (++n_sweep_ % kTrimEvery == 0) ::malloc_trim(0);
 }
@@ -106,7 +106,7 @@ void Io::answer(Job job, std::string response) {
   deliver(answer);
 }
 
-/// An act that waits has its answer still to come, so nothing may throw once it is in line.
+/// A queued act gets its answer later, so nothing may throw after an act is queued.
 void Io::submit(Job job) {
   if (state_.stopping || state_.draining) return refuse(std::move(job), shutting_down);
   Result<std::shared_ptr<ServedPolicy>> policy = policies_.find(job.policy_name);
@@ -120,7 +120,7 @@ void Io::submit(Job job) {
       });
     job.deadline = job.at + std::chrono::milliseconds(*allowed);
   }
-  deliver_waiting();  // acts that are late must not keep a place from one that can still be answered
+  deliver_waiting();  // late acts must not occupy the place of one that can still be answered
   const std::uint64_t request_id = job.request_id;
   Exchange::Jobs::Pushed pushed = exchange_.push(std::move(job));
   if (pushed.superseded)
@@ -137,7 +137,7 @@ void Io::submit(Job job) {
     });
 }
 
-/// Sends an answer. A client whose answer there is no memory for hears of that.
+/// Sends an answer, or reports to the client that memory for it ran out.
 void Io::send_answer(Answer& answer) noexcept {
   try {
     if (answer.error) answer.response = answer.job.call->encode(*answer.error);
@@ -153,8 +153,8 @@ void Io::send_without_memory(Answer& answer) noexcept {
   count_error();
 }
 
-/// A peer that has disconnected, or that has too many unread answers, loses this one; the server never waits for a
-/// peer. What can fail comes before it is sent, so that no request gets two answers.
+/// The answer is lost if its peer has disconnected or has too many unread answers: the server never waits for a peer.
+/// Everything that can fail runs before the answer is sent, so that no request gets two answers.
 void Io::deliver(Answer& answer) {
   const Job& job = answer.job;
   const net::Bytes* const native = job.call->native();
@@ -180,7 +180,7 @@ void Io::deliver(Answer& answer) {
   for (Observer* observer : observers_) observer->answered(answered);
 }
 
-/// An act in line could take as long as all before it: a server that stops finishes only what it has begun.
+/// Refuses all waiting acts: a server that stops finishes only the acts that it has begun.
 void Io::refuse_waiting() {
   while (std::optional<Job> job = exchange_.take_waiting()) refuse(std::move(*job), shutting_down);
 }

@@ -41,8 +41,8 @@ class Io {
   /// Runs until the server is stopped. Computed acts are answered then, waiting ones refused.
   void run();
 
-  /// For front ends: reports a received request. One of the next three must follow and answers it exactly once. If they
-  /// throw for lack of memory, the job is lost.
+  /// For front ends: reports a received request. The front end must then call exactly one of `submit`, `answer` and
+  /// `refuse`, which answers the request once. If that call throws for lack of memory, the job is lost.
   void received(const Received& request);
   /// Queues an act and checks its `deadline_ms`.
   void submit(Job job);

@@ -26,8 +26,8 @@ std::string last_part(const std::string& name) { return name.substr(name.rfind('
 struct Features {
   const v1::Description& description;
 
-  /// The full name of a feature that is given by it, by an alias or by the last part of either; empty where there is
-  /// none, or more than one.
+  /// Returns the full name of the feature whose name, alias, or last part of either is `given`; empty if no feature or
+  /// several features match.
   template <class Specs>
   static std::string find(const Specs& specs, const std::string& given) {
     std::string found;
@@ -72,12 +72,12 @@ std::string convention_told(const Convention& c, bool is_view) {
   return c.is_flipped ? told + ",flipped" : told;
 }
 
-/// The names as they are read, and who reads them.
+/// Builds names from a preset and lines.
 struct Reader {
   Names names;
   Features features;
   const char* option;
-  std::string missing_keys = {};  // of the preset, which no feature of the policy stands for
+  std::string missing_keys = {};  // required keys of the preset that match no feature of the policy
 
   Error refused(std::string expected, std::string found) const {
     return {Code::usage, option, std::move(expected), std::move(found),
@@ -105,7 +105,7 @@ struct Reader {
     return check_widths(preset);
   }
 
-  /// A policy for another robot is met here, and not when the robot moves.
+  /// Detects a policy for another robot here, before the robot moves.
   Status check_widths(const Preset& preset) const {
     for (const v1::StateSpec& state : features.description.states()) {
       int width = 0;
@@ -165,10 +165,10 @@ struct Reader {
     return {};
   }
 
-  /// A preset's key for such a view may still come from its robot, and then says that something is wrong.
+  /// Marks a view as absent and removes its key. An observation that still has the key is refused: something is wrong.
   void add_absent(const std::string& given) {
     const std::string view = features.view(given);
-    if (view.empty()) return;  // of another robot of the bundle: the engine has seen that there is such a view
+    if (view.empty()) return;  // a view of another robot of the bundle: the engine has checked that it exists
     names.absent.push_back(view);
     std::erase_if(names.views, [&](const Names::Entry& entry) { return entry.feature == view; });
   }
@@ -182,7 +182,7 @@ struct Reader {
     return refused("a view that is not --absent", "'" + printable(line) + "'");
   }
 
-  /// Everything that the policy must have comes from a key.
+  /// Checks that every required feature of the policy has a key, and returns the names.
   Result<Names> finish() {
     std::set<std::string> covered;
     for (const Names::Entry& entry : names.views)
@@ -213,7 +213,7 @@ const Value* at(const Value& message, std::string_view key) {
   return level == nullptr ? nullptr : at(*level, key.substr(slash + 1));
 }
 
-/// Keys of all levels that are values, with slashes between.
+/// Collects the keys of all values; slashes join the levels.
 void collect_keys(const Value& map, const std::string& prefix, std::vector<std::string>& keys) {
   for (std::size_t i = 0; i < map.items.size(); i += 2) {
     if (prefix.empty() && map.items[i].data == kExtension) continue;
@@ -278,7 +278,7 @@ void Names::to_client(std::vector<float>& values, std::size_t d_action) const {
         values[row + i] = columns.convention.to_client(values[row + i]);
 }
 
-/// A view begins with what no line begins with.
+/// A view begins with `=`, which no line does.
 std::string text_of(const Given& given) {
   std::string text;
   for (const std::string& line : given.lines) text += line + "\n";
@@ -388,7 +388,7 @@ Result<Observation> observe(const Value& message, const Names& names, const ActL
   ActLimits left = limits;
   for (const Names::Entry& entry : names.views) {
     const Value* value = at(message, entry.key);
-    if (value == nullptr) continue;  // the engine says which views must be there
+    if (value == nullptr) continue;  // the engine checks for required views
     VLA_TRY(const Array array, msgpack::array_of(*value, entry.key));
     const ImageLimits pixels{left.max_pixels, Code::too_large};
     VLA_TRY(Frame frame, frame_of(array, entry.key, pixels, entry.convention.is_bgr));

@@ -15,17 +15,17 @@
 
 namespace vla::serve {
 
-/// Errors: usage for a name that no policy may have.
+/// Checks the form of a policy's name. Errors: usage.
 Status check_policy_name(const std::string& name);
-/// The name and the bundle of `NAME=FILE`; a file alone has the name that it has without folders and `.gguf`.
+/// Splits `NAME=FILE` into name and bundle. The name of a FILE alone is its file name without folders and `.gguf`.
 std::pair<std::string, std::string> named_bundle(const std::string& text);
 
-/// A policy that the server answers with. It lives as long as one of its acts.
+/// A policy in service. Acts that use it keep it alive.
 struct ServedPolicy {
   std::string name;
   std::shared_ptr<Engine> engine;
   v1::Description description;
-  std::map<const Robot*, ChunkLimits> limits;  // of each robot; none without --limits
+  std::map<const Robot*, ChunkLimits> limits;  // each robot's limits; empty without --limits
   std::array<EncodedObservation, 2> encoded;   // one is prepared while the other is computed
 };
 
@@ -34,15 +34,17 @@ class Policies {
  public:
   explicit Policies(std::string default_name) : default_name_(std::move(default_name)) {}
 
-  /// From now on this one is the default: who names none keeps what it was told, whatever else is loaded.
+  /// Makes this policy the default: clients that name none keep the policy whose description they got, whatever
+  /// policies are loaded later.
   void keep_default(const std::string& name) { default_name_ = name; }
 
-  /// Without a name the default, or the only one. Errors: bad_observation, with the names that there are.
+  /// Finds a policy by name; without a name, the default or the only one. Errors: bad_observation, listing the names.
   Result<std::shared_ptr<ServedPolicy>> find(const std::string& name) const;
   /// Adds a policy, or replaces the one of the same name and returns that. Errors: incompatible if the new one differs
   /// in views, states, actions, rate or noise, which clients of the old one rely on.
   Result<std::shared_ptr<ServedPolicy>> put(std::shared_ptr<ServedPolicy> policy);
-  /// Takes one out. Errors: bad_observation where there is none of that name; usage for the last one and the default.
+  /// Removes a policy. Errors: bad_observation if no policy has this name; usage for the last policy and for the
+  /// default.
   Result<std::shared_ptr<ServedPolicy>> remove(const std::string& name);
 
   std::vector<std::shared_ptr<ServedPolicy>> all() const;

@@ -12,7 +12,7 @@ struct Preset {
   struct Key {
     const char* key;
     int width;             // width of a state; 0: an image
-    bool required;         // else the bundle may lack it
+    bool required;         // false: the bundle may lack it
     const char* features;  // last parts of names, separated by spaces
   };
   const char* name;

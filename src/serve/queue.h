@@ -21,11 +21,11 @@ namespace vla::serve {
 ///
 /// Peers take turns, and the clients of a peer take turns at its turns, in the order in which they began to wait: a
 /// peer is one key or one address, a client one connection of it. A newer act of a client takes the place of its older
-/// one. So neither a client that sends faster than others nor a peer that opens many connections gets more turns. Where
-/// more than `kCrowd` clients of one peer wait, as where a program floods the server from the robot's own machine,
-/// generations take turns first, which are connections that came together: many of them get as many turns as one that
-/// came long before them, or after. Where the queue is full, the peer that has most in it gives way to one that has
-/// less, and then within the peer the generation that has most.
+/// one. So neither a client that sends faster than others nor a peer that opens many connections gets more turns. If
+/// more than `kCrowd` clients of one peer wait, for example because a program floods the server from the robot's own
+/// machine, generations take turns first. A generation is a group of connections that arrived together; a generation of
+/// a hundred connections gets as many turns as a generation of one. If the queue is full, the peer with most in it
+/// gives way to a peer with less; within a peer, the generation with most gives way.
 ///
 /// A peer (in a crowd, a generation) goes first if it connected earlier and had fewer of the last `kRecent` turns. So
 /// robots that connected before a flood, and ask for less than half of what the server computes, wait only for the act
@@ -68,7 +68,7 @@ class Queue {
         result.refused.push_back(std::move(job));
         return result;
       }
-      result.refused.reserve(result.refused.size() + 1);  // read before it leaves the queue
+      result.refused.reserve(result.refused.size() + 1);  // allocates before the job leaves the queue
       result.refused.push_back(take(last));
     }
     if (older == line_.end()) {
@@ -86,7 +86,7 @@ class Queue {
     return late == line_.end() ? std::nullopt : std::optional<Job>(take(late));
   }
 
-  /// When `take_late` will have a job next.
+  /// Returns the earliest deadline of the waiting jobs.
   std::optional<Clock::time_point> first_deadline() const {
     std::optional<Clock::time_point> first;
     for (const Job& job : line_)
@@ -94,7 +94,8 @@ class Queue {
     return first;
   }
 
-  /// The client that waits longest, of the peer whose turn it is.
+  /// Removes the next job of the peer whose turn it is: that of the client that waits longest, or in a crowd that of
+  /// the next generation.
   std::optional<Job> pop() {
     if (line_.empty()) return std::nullopt;
     turns_.splice(turns_.end(), turns_, next_peer());
@@ -110,10 +111,10 @@ class Queue {
   using Place = typename std::list<Job>::iterator;
   struct Turn {
     std::string group;
-    Clock::time_point last = {};  // in a crowd: arrival of the connection that had its last turn
+    Clock::time_point last = {};  // in a crowd: arrival of the connection that had the group's last turn
   };
 
-  /// A turn that was had; of the group by its hash, so that it takes no memory.
+  /// A past turn. It holds a hash of the group, which needs no allocation.
   struct Recent {
     std::size_t group = 0;
     Clock::time_point since = {};
@@ -127,7 +128,7 @@ class Queue {
         recent_.begin(), recent_.end(), [hash = hash_of(group)](const Recent& turn) { return turn.group == hash; }));
   }
 
-  /// When the oldest connection of a group came that waits.
+  /// Returns when the oldest of the group's waiting connections arrived.
   Clock::time_point oldest_of(const std::string& group) const {
     Clock::time_point oldest = Clock::time_point::max();
     for (const Job& job : line_)
@@ -135,7 +136,7 @@ class Queue {
     return oldest;
   }
 
-  /// The first in line, or one that came before it and had fewer turns of late.
+  /// Returns the first peer in line, or one that connected earlier and had fewer of the recent turns.
   typename std::list<Turn>::const_iterator next_peer() const {
     auto next = turns_.begin();
     for (auto turn = std::next(next); turn != turns_.end(); ++turn)
@@ -165,16 +166,16 @@ class Queue {
         std::count_if(line_.begin(), line_.end(), [&](const Job& job) { return job.share.group == group; }));
   }
 
-  /// The generations of a group's waiting clients and the given ones.
+  /// Returns the generations that the group's waiting clients and the given times of arrival form.
   Generations generations_of(const std::string& group, std::vector<Clock::time_point> times = {}) const {
     for (const Job& job : line_)
       if (job.share.group == group) times.push_back(job.share.since);
     return Generations(std::move(times));
   }
 
-  /// In a crowd: the group's first job of the next older generation after the one that had the last turn; after the
-  /// oldest comes the newest. Later arrivals are newer and delay nobody. An older generation that had fewer turns of
-  /// late comes first.
+  /// In a crowd: returns the group's first job of the next older generation after the one that had the last turn; the
+  /// newest follows the oldest. Later arrivals are newer and delay nobody. An older generation that had fewer of the
+  /// recent turns comes first.
   Place next_generation(Turn& turn) {
     const Generations generations = generations_of(turn.group, {turn.last});  // that connection may have left the queue
     const auto distance = [&](const Job& job) {
@@ -195,7 +196,8 @@ class Queue {
     return next;
   }
 
-  /// The job that must leave so that the given one fits, which adds `amount` to its peer; none if that would be unfair.
+  /// Returns the job that must leave so that the given one fits; none if that would be unfair. `added`: what the given
+  /// job adds to its peer's sum of `amount`.
   template <class Amount>
   Place to_give_way(const Job& job, Amount amount, std::size_t added) {
     std::map<std::string, std::size_t> sums = {{job.share.group, added}};
@@ -205,8 +207,8 @@ class Queue {
     return last_of_largest_generation(job.share.group, amount, &job, added);
   }
 
-  /// The last job of the group's largest generation, the newest if several are equal. None if the newcomer's own
-  /// generation would be as large.
+  /// Returns the last job of the group's largest generation, the newest generation if several are equal. None if the
+  /// newcomer's own generation would be as large.
   template <class Amount>
   Place last_of_largest_generation(const std::string& group, Amount amount, const Job* newcomer = nullptr,
                                    std::size_t added = 0) {
@@ -234,7 +236,7 @@ class Queue {
   }
 
   Limits limits_;
-  std::list<Job> line_;    // at most as many clients as fit: a linear search costs nothing beside an act
+  std::list<Job> line_;    // at most Limits::jobs: a linear search costs nothing beside an act
   std::list<Turn> turns_;  // peers with a queued job, the next one first
   std::size_t bytes_ = 0;
   std::array<Recent, kRecent> recent_;  // the last turns, in a ring

@@ -17,7 +17,7 @@ std::string name_of(const Engine& engine) {
   return std::filesystem::path(engine.robot().bundle().path()).filename().string();
 }
 
-/// Reads an entry; throws what nlohmann throws of one that is none.
+/// Reads an entry. Throws nlohmann's exception if it is invalid.
 std::pair<std::string, ActShape> entry_of(const ordered_json& json) {
   ActShape act;
   InputShape& in = act.inputs;
@@ -86,7 +86,7 @@ void SeenSizes::add(const Engine& engine) {
   if (!written && tell_) std::exchange(tell_, nullptr)(written.error());
 }
 
-/// An entry a line.
+/// Writes one entry per line.
 std::string SeenSizes::text() const {
   std::string lines;
   for (const auto& [bundle, act] : all_) lines += (lines.empty() ? "[" : ",\n ") + json_of(bundle, act).dump();

@@ -13,20 +13,20 @@
 
 namespace vla::serve {
 
-/// The sizes of acts that a server has computed, in a file. The next start computes one of each, so that no client pays
-/// for its plan, and on a GPU for its graph of thousands of kernels. Any thread.
+/// Keeps the input sizes of a server's acts in a file. The next start computes one act of each size, so that no client
+/// waits for its plan or, on a GPU, for its graph of thousands of kernels. Any thread may use it.
 class SeenSizes {
  public:
-  /// So many are kept, the newest: each takes an act at the start.
+  /// Number of sizes kept, the newest ones: each costs an act at the start.
   static constexpr std::size_t kMost = 32;
 
-  /// Reads the file; one that is not there is made with the first act. `tell` gets the error of a file that cannot be
-  /// written, once. Errors: io, usage (a file of something else).
+  /// Reads the file; if it is missing, the first act creates it. `tell` is called once with the error if the file
+  /// cannot be written. Errors: io; usage if the file contains something else.
   static Result<std::unique_ptr<SeenSizes>> open(std::string path, std::function<void(const Error&)> tell);
 
-  /// Those of a bundle, by the name of its file.
+  /// Returns the sizes of a bundle, found by the name of its file.
   std::vector<ActShape> of(const Engine& engine) const;
-  /// Keeps the size of the engine's last act, and writes the file where it is new.
+  /// Keeps the size of the engine's last act, and writes the file if the size is new.
   void add(const Engine& engine);
 
  private:
@@ -40,7 +40,7 @@ class SeenSizes {
   std::string path_;
   std::function<void(const Error&)> tell_;
   mutable std::mutex mutex_;
-  std::vector<Entry> all_;  // in the order in which they came
+  std::vector<Entry> all_;  // oldest first
 };
 
 }  // namespace vla::serve

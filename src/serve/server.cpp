@@ -28,8 +28,8 @@
 namespace vla::serve {
 namespace {
 
-constexpr std::size_t kQueueMessages = 8;  // acts that wait may hold so many times the largest message
-/// Kept from connections for whoever watches the server, log, recording, and the sockets that listen.
+constexpr std::size_t kQueueMessages = 8;  // waiting acts may together hold this many times the largest message
+/// File descriptors that connections leave free: for monitoring, the log, the recording and the listening sockets.
 constexpr std::size_t kKeptDescriptors = 16;
 
 using Opened = Result<std::unique_ptr<Front>>;
@@ -54,8 +54,8 @@ const DoorFront::Door kLeRobot{"vla-door-lerobot",      "--lerobot",     "lerobo
 /// A protocol and its front end.
 struct Protocol {
   const char* name;
-  std::string ServerOptions::*address;  // it is served where this is not empty; null: always
-  std::size_t n_descriptor;             // of this process for a connection
+  std::string ServerOptions::*address;  // its address; not served if empty; null: always served
+  std::size_t n_descriptor;             // descriptors that a connection takes in this process
   Opened (*open)(net::Loop& loop, const ServerOptions& options);
   Result<Names> (*names_of)(const ServerOptions& options, const v1::Description& description);
 
@@ -70,8 +70,8 @@ const Protocol kProtocols[] = {
      lerobot_names_of},
 };
 
-/// The options with as few connections as there are descriptors for: what watches a server has to reach one that has
-/// all of its connections.
+/// Limits the connections to the available file descriptors, so that monitoring can reach a server whose connections
+/// are all in use. Errors: io.
 Result<ServerOptions> within_descriptors(ServerOptions options) {
   std::size_t n_each = 0;
   for (const Protocol& protocol : kProtocols) n_each += protocol.is_wanted(options) ? protocol.n_descriptor : 0;
@@ -126,7 +126,7 @@ Result<std::unique_ptr<Server>> Server::open(const ServerOptions& asked, Now now
     server->fronts_.push_back(std::move(front));
   }
   return server;
-} catch (const std::runtime_error& no_descriptor) {  // of Asio
+} catch (const std::runtime_error& no_descriptor) {  // thrown by Asio
   return Error{Code::io, "sockets", "what they need of the system", no_descriptor.what()};
 }
 
@@ -186,7 +186,7 @@ Status Server::begin() {
   return {};
 }
 
-/// Posts work for the I/O thread to its loop, which ends before the server does.
+/// Posts the work to the I/O thread's loop. If that thread ends first, the work never runs.
 template <class Work>
 auto Server::on_io_thread(Work work) -> decltype(work()) {
   const auto task = std::make_shared<std::packaged_task<decltype(work())()>>(std::move(work));
@@ -198,7 +198,7 @@ auto Server::on_io_thread(Work work) -> decltype(work()) {
   return done.get();
 }
 
-/// Until nobody else holds it: its acts are answered, and its memory is given back on this thread.
+/// Waits until no act holds the policy, so that this thread frees its memory.
 void Server::await_last_act(std::shared_ptr<ServedPolicy> policy) const {
   while (policy != nullptr && policy.use_count() > 1 && !state_.ended)
     std::this_thread::sleep_for(std::chrono::milliseconds(1));
@@ -235,7 +235,7 @@ std::vector<std::string> Server::told() const {
   return all;
 }
 
-/// Programs run on the thread that calls this.
+/// The calling thread runs the engine's computations.
 Status Server::run(std::span<Observer* const> observers) {
   observers_ = observers;
   records_ = std::any_of(observers.begin(), observers.end(), [](const Observer* o) { return o->records(); });

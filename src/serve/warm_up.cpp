@@ -10,10 +10,11 @@
 namespace vla::serve {
 namespace {
 
-/// Observations that are tried: a state of our making may be none of the robot's, as zeros are no rotation.
+/// Number of observations to try: a synthetic state may be invalid for the robot, as zeros are no rotation.
 constexpr std::uint64_t kTries = 3;
 
-/// As many words as the prompt takes: where its own tokens must stay whole, fewer than it has tokens.
+/// Returns a text of as many words as the prompt accepts: fewer than its tokens if the prompt's own tokens must not be
+/// cut off.
 std::string longest_text(const Processor& processor, Observation observation) {
   Inputs inputs;
   for (int n_word = processor.recipe().max_tokens; n_word > 0; n_word = n_word * 3 / 4) {
@@ -24,7 +25,7 @@ std::string longest_text(const Processor& processor, Observation observation) {
   return {};
 }
 
-/// The middle of a state's training data, where the bundle says what that is, else zeros.
+/// The middle of a state's training data, from the normalization statistics; zeros if the bundle has none.
 std::vector<float> middle_of(const Robot& robot, const std::string& state, std::size_t width) {
   const auto stats = [&](const char* name) { return robot.bundle().stats(fmt::format("stats.{}.{}", state, name)); };
   std::vector<float> middle(width);
@@ -38,7 +39,7 @@ std::vector<float> middle_of(const Robot& robot, const std::string& state, std::
   return middle;
 }
 
-/// The state that a try has: the middle, then places around it.
+/// The state of try `number`: the middle, then random places around it.
 std::vector<float> state_of(const Robot& robot, const std::string& state, std::size_t width, std::uint64_t number) {
   std::vector<float> values = middle_of(robot, state, width);
   if (number == 0) return values;
@@ -68,9 +69,10 @@ Observation largest_observation(const Robot& robot, std::uint64_t number) {
   return observation;
 }
 
-/// Acts. A policy that decodes tokens computes the first one only, since grey frames may be answered with a text.
+/// Computes an act. A policy that decodes tokens computes only the first token, since it may answer grey frames with a
+/// text.
 Status act(Engine& engine, const Robot& robot, const Observation& observation, std::uint64_t seed) {
-  EncodedObservation encoded;  // its memory is not kept: every act that is served brings its own
+  EncodedObservation encoded;  // not kept: every served act has its own memory
   VLA_CHECK(engine.encode(observation, Noise(seed), {}, encoded));
   if (robot.solver().decodes) return engine.warm_up({observation.embodiment, robot.shape_of(encoded)});
   VLA_CHECK(engine.send_ahead(encoded));
@@ -78,7 +80,7 @@ Status act(Engine& engine, const Robot& robot, const Observation& observation, s
   return chunk ? Status() : chunk.error();
 }
 
-/// The refusal of a policy, with the place in it where numbers are not finite first.
+/// The refusal of a policy. It names the first tap of the network with values that are not finite.
 Error not_finite(Engine& engine, const Observation& observation, std::uint64_t seed) {
   const Result<std::string> tap = engine.find_not_finite(observation, Noise(seed));
   return {Code::bad_action, "warm-up", "finite actions",

@@ -13,7 +13,7 @@
 
 namespace {
 
-/// ggml does not export its own instance.
+/// The driver's name and version. Makes a Vulkan instance, because ggml does not export its own.
 std::string driver(ggml_backend_dev_t device) {
   std::string text = "driver unknown";
   const VkApplicationInfo application = {.sType = VK_STRUCTURE_TYPE_APPLICATION_INFO, .apiVersion = VK_API_VERSION_1_2};

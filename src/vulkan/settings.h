@@ -22,8 +22,8 @@ inline char* vla_vulkan_setting(const char* name) {
 }
 #define getenv(name) vla_vulkan_setting(name)
 
-// Debug-layer settings exist since headers 1.3.272. ggml names their types in code that a release build never runs.
-// Here they have the extension's layout and set nothing.
+// Vulkan's headers define debug-layer settings since 1.3.272. ggml names their types in code that a release build never
+// runs. For older headers these types have the extension's layout and set nothing.
 #ifndef VK_EXT_LAYER_SETTINGS_EXTENSION_NAME
 namespace vk {
 enum class LayerSettingTypeEXT : int { eBool32 };

@@ -33,7 +33,7 @@ using boost::system::error_code;
 using net::Standing;
 
 constexpr std::size_t kMaxAnswers = 64;  // answers that a connection may leave unread
-// unread bytes after which a connection is not read from; twice as many are kept
+// unread bytes at which the hub stops reading from a connection; at twice as many it drops further answers
 constexpr std::size_t kMaxUnread = 128 << 10;
 constexpr int kTurn = 4;  // messages of a connection before others get a turn
 constexpr int kHandshakePatience = 10, kSilencePatience = 15, kPingAfter = 5;  // in sweeps
@@ -59,8 +59,8 @@ std::optional<asio::ip::address> address_of_interface(const std::string& name) {
   return found;
 }
 
-/// Splits a `tcp://` endpoint into HOST and PORT. HOST is an address, an IPv6 address in brackets, an interface, or
-/// `*`.
+/// Returns the address and port of HOST:PORT. HOST is an address, an IPv6 address in brackets, an interface, or `*`.
+/// None if HOST is not an address and no interface with an address.
 std::optional<tcp::endpoint> tcp_endpoint(const std::string& where) {
   const std::size_t colon = where.rfind(':');
   std::string host = where.substr(0, colon);
@@ -162,7 +162,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
     slow_ = session_.is_receiving() ? slow_ + 1 : 0;
     if (!session_.is_open() && age_ > kHandshakePatience) return drop("handshake", "none within 10 s");
     if (silent_ > kSilencePatience) return drop("silent", "no byte for 15 s");
-    // A peer's heartbeats wait behind its request. While that arrives, ours show that the server is alive.
+    // A peer's heartbeats wait behind its request. While the request arrives, pings show the peer that the server is
+    // alive.
     if (session_.is_open() && out_.empty() && (slow_ > 1 || silent_ > kPingAfter)) send(session_.ping());
   }
 
@@ -247,7 +248,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   Shared& shared_;
   Socket socket_;
   Client client_;
-  const std::string group_;  // of its address
+  const std::string group_;  // group of the peer's address
   Session session_;
   std::deque<std::string> out_;  // the first one is being written
   Clock::time_point began_ = client_.since, served_ = {};
@@ -274,7 +275,7 @@ class Hub::Sockets : public Shared {
         if (path.front() == '@') {
           path.front() = '\0';  // an abstract address has no file
         } else {
-          ::unlink(path.c_str());  // no process serves it: that was checked
+          ::unlink(path.c_str());  // check_free found no process that serves it
           paths_.push_back(path);
         }
         locals_.emplace_back(loop.context(), Local::endpoint(path));

@@ -23,7 +23,7 @@ struct Client {
 };
 
 /// The sockets of a ZeroMQ ROUTER: listeners and connections. Everything runs inside the loop's `wait`, which never
-/// blocks on a peer. A peer that does not read its answers is not read from meanwhile.
+/// blocks on a peer. It does not read from a peer that leaves its answers unread.
 class Hub {
  public:
   using Limits = net::ConnectionLimits;

@@ -18,7 +18,7 @@ constexpr unsigned kMore = 1, kLong = 2, kCommand = 4;   // flags of a frame
 constexpr unsigned kMoreInside = 1, kCommandInside = 2;  // flags inside a CURVE box
 constexpr int kMaxFrames = 1024;                         // frames of a refused message that are skipped
 constexpr std::size_t kMaxEnvelope = 8;                  // frames of an envelope
-constexpr std::size_t kMaxAddress = 255;                 // bytes of such a frame, as in ZeroMQ
+constexpr std::size_t kMaxAddress = 255;                 // bytes of an envelope's frame, as in ZeroMQ
 constexpr std::size_t kGreeting = 64, kMaxCommand = 4096;
 constexpr std::size_t kStep = 256 << 10;     // most bytes read at once, so that connections take turns
 constexpr std::size_t kPrefix = 64;          // bytes kept of a refused message: enough for its number
@@ -238,7 +238,7 @@ Status Session::heartbeat(std::span<const std::byte> command) {
   return {};
 }
 
-/// Whether frames of an envelope came, and not yet the empty one that ends it.
+/// Whether frames of an envelope have arrived, but not yet the empty frame that ends it.
 bool Session::is_addressed() const {
   return message_ && !message_->envelope.empty() && !message_->envelope.back().empty();
 }

@@ -16,14 +16,15 @@
 
 namespace vla::zmtp {
 
-/// The frames before a message, with which its answer begins: an empty one of a REQ socket, and before it the number of
-/// the request, if the socket correlates, or the addresses that proxies add. A DEALER socket sends none.
+/// The frames before a message; its answer begins with the same frames. A REQ socket sends an empty frame. Before it
+/// comes the request's number, if the socket correlates requests, or the addresses that proxies add. A DEALER socket
+/// sends none.
 using Envelope = std::vector<std::string>;
 
 /// One message of a peer.
 struct Message {
   net::Bytes bytes;              // bytes of its frame; only the first ones if the message is refused
-  Envelope envelope;             // up to its empty frame
+  Envelope envelope;             // frames up to and including the empty one
   std::size_t size = 0;          // size that the peer announced
   std::optional<Error> refused;  // bad_request (several frames), too_large, out_of_memory
 };
@@ -77,15 +78,15 @@ class Session {
   State state_ = State::greeting;
   std::array<std::byte, 4096> staging_;  // received bytes that belong to no frame yet, from begin_ to end_
   std::size_t begin_ = 0, end_ = 0;
-  bool filling_frame_ = false;  // whether `room` was inside the frame
+  bool filling_frame_ = false;  // whether the last room() was part of `frame_`
 
   bool in_frame_ = false;
   unsigned flags_ = 0;
   std::uint64_t size_ = 0, got_ = 0;
-  net::Bytes frame_;  // the bytes that are kept of it
+  net::Bytes frame_;  // kept bytes of the current frame
 
   std::optional<Message> message_;
-  int n_part_ = 0, n_frame_ = 0;  // of `message_`: kept parts, and all frames so far
+  int n_part_ = 0, n_frame_ = 0;  // kept parts of `message_`, and all its frames so far
   std::string output_;
   const std::string no_key_;
 };

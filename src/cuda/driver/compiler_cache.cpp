@@ -18,7 +18,8 @@ std::string variable(const char* name) {
 
 bool is_writable(const std::string& folder) { return !folder.empty() && ::access(folder.c_str(), W_OK | X_OK) == 0; }
 
-/// A folder that another user made or may write to is not taken: its code would run on the device.
+/// A private folder for temporary files, or empty. Refuses a folder that another user owns or may access, because the
+/// code in it runs on the device.
 std::string temporary() {
   std::error_code failed;
   const std::filesystem::path all = std::filesystem::temp_directory_path(failed);

@@ -6,11 +6,10 @@
 
 namespace vla::cuda {
 
-/// The folder in which NVIDIA's driver is to keep the machine code that it compiles of our PTX, ten seconds of work
-/// and more, for the next process. Empty where the driver has one: CUDA_CACHE_PATH, or .nv in a home that it may write
-/// to. A service and a bare container have neither; then XDG_CACHE_HOME is taken, or a folder for temporary files that
-/// only this user can read and write, which is made. Empty too where there is no such folder: every process compiles
-/// then.
+/// The folder where NVIDIA's driver should cache the machine code that it compiles from our PTX; compiling takes ten
+/// seconds or more. Empty if the driver has a folder already: CUDA_CACHE_PATH, or .nv in a writable home. A service or
+/// a bare container has neither; then this is a folder in XDG_CACHE_HOME, or else one for temporary files that this
+/// function creates and only this user can access. Empty too if neither is writable: then every process compiles.
 std::string compiler_cache();
 
 }  // namespace vla::cuda

@@ -13,7 +13,7 @@ namespace vla::cuda {
 Result<Driver> load_driver() {
   if (const std::string folder = compiler_cache(); !folder.empty()) setenv("CUDA_CACHE_PATH", folder.c_str(), 0);
   constexpr const char* kFile = "libcuda.so.1";
-  void* library = dlopen(kFile, RTLD_NOW | RTLD_LOCAL);  // never closed: it keeps threads
+  void* library = dlopen(kFile, RTLD_NOW | RTLD_LOCAL);  // never closed: its threads keep running
   if (library == nullptr) return Error{Code::device, "cuda", "NVIDIA's driver", dlerror()};
   Driver driver;
 #define VLA_CUDA_CALL(name, symbol, ...)                                             \

@@ -7,14 +7,14 @@
 
 #include "base/result.h"
 
-/// The functions of NVIDIA's driver that we call, in a table, so that building needs nothing of NVIDIA and a test can
-/// use a driver of its own. Source: CUDA Driver API 13.0.
+/// A table of the functions of NVIDIA's driver that we call. With it the build needs no NVIDIA software, and a test can
+/// use its own driver. Source: CUDA Driver API 13.0.
 namespace vla::cuda {
 
 using Address = std::uint64_t;  // CUdeviceptr
 using Handle = void*;           // a context, stream, event, module, function or graph
 
-/// CUlaunchAttribute: an int of the value is its first bytes.
+/// CUlaunchAttribute. An int value is stored in the first bytes of `value`.
 struct LaunchAttribute {
   int id, padding;
   std::uint64_t value[8];

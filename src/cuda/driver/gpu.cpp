@@ -23,7 +23,7 @@ std::string version_text(int version) {
   return std::to_string(version / 1000) + "." + std::to_string(version % 1000 / 10);
 }
 
-/// The architecture that PTX names, with "a" behind one that no other device runs; empty where it names none.
+/// The target architecture of PTX, such as "90", or "90a" if no other architecture runs it; empty if PTX names none.
 std::string target_of(const std::string& ptx) {
   constexpr std::string_view kTarget = ".target sm_";
   const std::size_t at = ptx.find(kTarget);
@@ -32,7 +32,7 @@ std::string target_of(const std::string& ptx) {
   return ptx.substr(first, ptx.find_first_not_of("0123456789a", first) - first);
 }
 
-/// Whether PTX is for a device of this capability. PTX that names no architecture is for all.
+/// Whether to load PTX for this target on a device of this capability. An empty target fits every device.
 bool is_for(const std::string& target, int capability) {
   return target.empty() || target == (capability < 90 ? "80" : "90") || target == std::to_string(capability) + "a";
 }
@@ -64,7 +64,7 @@ Status check_call(const Driver& driver, const char* call, int result) {
                (name ? name : "error " + std::to_string(result)) + (text ? std::string(", ") + text : "")};
 }
 
-/// How many devices there are. Errors: device, for a driver that is too old too.
+/// Initializes the driver and returns the number of devices. Errors: device, also if the driver is too old.
 Result<int> start_driver(const Driver& driver) {
   int version = 0, n_device = 0;
   VLA_CHECK(check_call(driver, "init", driver.init(0)));
@@ -144,8 +144,8 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
   return {};
 }
 
-/// A module, of its machine code unless there is none or the driver refuses that. Where the driver's compiler refuses
-/// PTX, the error has what it says.
+/// Loads a module from its machine code, or from PTX if there is no machine code or the driver refuses it. If the
+/// driver's compiler refuses the PTX, the error contains the compiler's message.
 Result<Owned> Gpu::load(const std::string& ptx, const std::string* machine_code) const {
   std::array<char, 4096> log = {};
   int options[] = {kErrorLog, kErrorLogSize};
@@ -231,7 +231,7 @@ Status Gpu::prepare(const Launch& how) {
   return {};
 }
 
-/// The function of a kernel, which is allowed the shared memory that the launch asks for.
+/// Returns a kernel's function and permits it the launch's amount of shared memory.
 Result<Handle> Gpu::kernel(const Launch& how) {
   Function& function = functions_[how.kernel];
   if (function.module == nullptr) function.module = unlisted_;
@@ -277,13 +277,13 @@ Status Stream::after(const Owned& event) {
 
 Status Stream::note_time(const Owned& event) {
   follows_kernel_ = false;
-  constexpr unsigned kExternal = 1;  // a node of the graph, instead of a point that other streams wait for
+  constexpr unsigned kExternal = 1;  // records at a node of the graph, not at a point for other streams to wait for
   return CALL(event_record_flags, event.get(), stream_.get(), kExternal);
 }
 
 Status Stream::launch_job(const Launch& how, const void* job) {
   VLA_TRY(Handle function, gpu_->kernel(how));
-  void* parameters[] = {const_cast<void*>(job)};  // the driver copies what it points at
+  void* parameters[] = {const_cast<void*>(job)};  // the driver copies the job
   LaunchAttribute overlaps = {kOverlaps, 0, {1}};
   const bool may_overlap = follows_kernel_ && gpu_->capability_ >= 90;
   const LaunchConfig config = {.grid_x = how.grid.x,

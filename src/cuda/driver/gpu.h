@@ -10,11 +10,11 @@
 #include "cuda/driver/driver.h"
 #include "cuda/kernels/launch.h"
 
-/// A device and its resources. A driver failure is a typed Error that names the call: out_of_memory if the driver says
-/// so, else device. Resources are released once; failures while releasing are ignored.
+/// A device and its resources. A driver failure is an Error that names the call: out_of_memory if the driver reports
+/// that, else device. Resources are released once; failures while releasing are ignored.
 namespace vla::cuda {
 
-/// A driver object that is released with this one.
+/// Owns a driver object and releases it on destruction.
 class Owned {
  public:
   using Release = int (*)(Handle);
@@ -28,8 +28,8 @@ class Owned {
 
 class Gpu;
 
-/// Device memory; destroy it before the device. Without a Gpu nothing is allocated, and the address says where it would
-/// be.
+/// Device memory; destroy it before the device. If `gpu` is null, the buffer owns nothing and the address is only
+/// planned.
 class Buffer {
  public:
   Buffer(const Gpu* gpu, Address address, std::size_t size) : gpu_(gpu), address_(address), size_(size) {}
@@ -59,14 +59,14 @@ class Stream {
   /// Host memory must stay valid until the stream is waited for.
   Status upload(Address to, const void* from, std::size_t size);
   Status download(void* to, Address from, std::size_t size);
-  /// On the device.
+  /// Copies within device memory.
   Status copy(Address to, Address from, std::size_t size);
   template <class Job>
   Status launch(const Launch& how, const Job& job) {
     return launch_job(how, &job);
   }
-  /// Launches a kernel; `job` points to its parameter. From Hopper on it may begin while the kernel just before it in
-  /// the stream ends, and itself waits for that one's results (device.h, wait_for_earlier).
+  /// Launches a kernel; `job` points to its parameter. From Hopper on, the kernel may begin before the stream's
+  /// previous kernel ends, and waits for the previous kernel's results itself (device.h, wait_for_earlier).
   Status launch_job(const Launch& how, const void* job);
   /// Waits until all operations are done.
   Status wait();
@@ -76,11 +76,11 @@ class Stream {
   Status record(const Owned& event);
   /// Makes later operations wait for `event`.
   Status after(const Owned& event);
-  /// During capture: records the time in `event` each time the graph gets here.
+  /// During capture: adds a node that records the time in `event` at every run of the graph.
   Status note_time(const Owned& event);
 
-  /// Captures operations into a graph instead of running them, also those of streams that wait for this one. Join those
-  /// streams with after() before the end of the capture.
+  /// Captures operations into a graph instead of running them, also operations of streams that wait for this one. Make
+  /// this stream wait for such streams with after() before the capture ends.
   Status begin_capture();
   /// The captured graph, instantiated.
   Result<Owned> end_capture();
@@ -111,10 +111,10 @@ class Gpu {
   /// The first driver that takes machine code of CUDA 13's compiler.
   static constexpr int kCodeDriver = 13000;
 
-  /// Opens the device's context and loads those of the modules, PTX texts, that are of its architecture: of texts for
-  /// sm_80 and for sm_90 the latter from Hopper on; one for sm_90a on Hopper alone. Behind a text may stand machine
-  /// code (an ELF file) of it for exactly that architecture, which is loaded instead where the driver takes it: nothing
-  /// is compiled then.
+  /// Opens the device's context and loads the modules for its architecture. A module is a PTX text: one for sm_80 is
+  /// loaded before Hopper, one for sm_90 from Hopper on, and one for sm_90a on Hopper only. The next entry after a text
+  /// may be its machine code (an ELF file) for exactly that architecture. If the driver accepts the machine code, it is
+  /// loaded instead and nothing is compiled.
   static Result<std::unique_ptr<Gpu>> open(const Driver& driver, int device, const std::vector<std::string>& modules);
   Gpu(const Gpu&) = delete;
   ~Gpu();
@@ -123,20 +123,20 @@ class Gpu {
   /// this themselves.
   Status use() const;
 
-  /// How many blocks of large kernels run at a time, approximately.
+  /// The number of multiprocessors: about how many blocks of large kernels run at a time.
   int n_sm() const { return n_sm_; }
   const std::string& name() const { return name_; }
-  /// Of compute capability 9.0, with units that no other GPU has.
+  /// Whether the compute capability is 9.0, whose wgmma instructions no other GPU has.
   bool is_hopper() const { return capability_ == 90; }
-  /// Has the driver load a kernel and allow it its shared memory, as the first launch does. Before a capture: a driver
-  /// may have to wait or to allocate for it, which no stream that captures allows.
+  /// Loads a kernel and permits it its shared memory, as the first launch would. Call it before a capture: the driver
+  /// may have to wait or to allocate memory, which is not allowed while a stream captures.
   Status prepare(const Launch& how);
-  /// out_of_memory with both sizes where less is free.
+  /// Errors: out_of_memory, with both sizes, if less memory is free.
   Result<Buffer> allocate(std::size_t size, const std::string& what);
   /// Pinned host memory, which the device reads and writes without the processor.
   Result<Owned> allocate_host(std::size_t size);
   Result<Stream> stream();
-  /// For Stream::note_time, or for `record` without timing.
+  /// Creates an event: with time for Stream::note_time, without for Stream::record.
   Result<Owned> event(bool has_time);
   /// Milliseconds between two recorded events.
   Result<float> elapsed(const Owned& first, const Owned& second) const;
@@ -159,10 +159,10 @@ class Gpu {
   std::string name_;
   Handle context_ = nullptr;
   std::vector<Owned> modules_;
-  Handle unlisted_ = nullptr;  // the module of kernels that no text lists, as a test's driver has
+  Handle unlisted_ = nullptr;  // the module of kernels that no PTX text names; only a test's driver has one
   struct Function {
     Handle module = nullptr, handle = nullptr;
-    unsigned shared = 48 << 10;  // bytes of shared memory that it may use
+    unsigned shared = 48 << 10;  // bytes of shared memory that the kernel may use
   };
   std::map<std::string, Function> functions_;
 };

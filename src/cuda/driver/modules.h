@@ -7,8 +7,8 @@
 
 namespace vla::cuda {
 
-/// All kernels as Gpu::open takes them: PTX inside the library, and behind some their machine code; or the names that a
-/// test's driver knows.
+/// All modules, as Gpu::open takes them: the library's PTX texts, some followed by their machine code. A test links its
+/// own definition, which returns the module name that its driver knows.
 std::vector<std::string> kernel_modules();
 
 }  // namespace vla::cuda

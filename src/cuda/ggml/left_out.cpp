@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-// Stand-ins for sources of ggml's CUDA backend that the build leaves out, because no graph of ours has their operations
-// (src/CMakeLists.txt lists the sources that are built). The linker reports a missing one; a graph that reaches one
-// ends the process with its name.
+// Stand-ins for the functions of ggml's CUDA backend that the build leaves out, because no graph of ours has their
+// operations (src/CMakeLists.txt lists the sources that are built). The linker reports a missing stand-in. A graph that
+// calls one aborts the process with a message that names the function.
 #include <ggml-backend.h>
 #include <ggml.h>
 
@@ -15,7 +15,8 @@ struct ggml_cuda_gated_delta_net_fused_cache {};  // passed by value and never r
 struct ggml_cuda_mm_fusion_args_host;
 struct ggml_cuda_topk_moe_args;
 
-// Alternatives to kernels that are built; none is selected. The first would compute products of few columns in TF32.
+// Selectors of alternative kernels: none is ever selected. The first one's kernel would compute products of few columns
+// in TF32.
 bool ggml_cuda_should_use_mmf(ggml_type, int, int, const std::int64_t*, const std::size_t*, int, bool) { return false; }
 bool ggml_cuda_should_use_mmq(ggml_type, int, std::int64_t, std::int64_t) { return false; }
 bool ggml_cuda_should_use_mmvq(ggml_type, int, std::int64_t) { return false; }

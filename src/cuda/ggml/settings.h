@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-// Included before every CUDA source of ggml by the compiler's command line, so that ggml itself is unchanged. It fixes
-// what changes numbers: products are computed in the type of their weights on the device.
+// The compiler's command line includes this file before every CUDA source of ggml, so that ggml itself is unchanged. It
+// fixes the settings that change numbers: products are computed in the type that their weights have on the device.
 #pragma once
 
 #include <cublas_v2.h>
@@ -9,7 +9,7 @@
 #include <cstdlib>
 #include <cstring>
 
-/// Replaces the environment that ggml reads, except for the type of products.
+/// Replaces getenv in ggml: fixes the type of products and passes every other variable through.
 inline char* vla_cuda_setting(const char* name) {
   static char of_weights[] = "auto";
   return std::strcmp(name, "GGML_CUDA_CUBLAS_COMPUTE_TYPE") == 0 ? of_weights : std::getenv(name);

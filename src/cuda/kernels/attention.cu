@@ -5,7 +5,7 @@
 namespace vla::cuda {
 namespace {
 
-/// The block's share of the keys of all segments, in whole sixteens: `first` to last - 1.
+/// The block's share of the keys of all segments, in multiples of 16: keys `first` to last - 1.
 struct Share {
   int n_key, first, last;
   VLA_DEVICE explicit Share(const AttentionJob& job) : n_key(count_keys(job)) {
@@ -24,12 +24,12 @@ struct Shape {
   static constexpr int kRow = kOf.row(), kTile = kKeys * kRow;
   VLA_DEVICE static constexpr int weight_row() { return kKeys * 2 + 16; }
   static constexpr bool kKeepsQ = kDepth <= 128;  // queries in registers
-  // Of a warp: keys in a tile, products of 16 x 8 x 16 in a row of scores and in the result, sums side by side for
-  // each.
+  // Of one warp: its keys of a tile, steps of 16 elements of the depth for a score, tiles of 8 columns of the result,
+  // and independent accumulators for scores and for the result.
   static constexpr int kOwnKeys = kKeys / kGroups, kSteps = kDepth / 16, kTiles = kDepth / 8 / kGroups;
   static constexpr int kScoreSums = kOwnKeys >= 32 ? 1 : 2, kSums = kTiles == 1 ? 2 : 1;
 
-  // Threads that copy a row, 16 bytes each: a power of two, so that each keeps its column.
+  // Threads that copy a row, 16 bytes each: a power of two, so that a thread copies the same column of every row.
   static constexpr int kPerRow = kDepth == 80 ? 16 : kDepth / 8, kRowStep = kThreads / kPerRow;
   /// The first row that this thread copies, and its column.
   VLA_DEVICE static int copied_row() { return thread_index() / kPerRow; }
@@ -42,19 +42,19 @@ VLA_DEVICE void clear_rows(int begin, int end, std::byte* to) {
   for (int row = S::copied_row(); row < end; row += S::kRowStep)
     if (row >= begin) dev::write(to + row * S::kRow + S::copied_column() * 2, uint4{0, 0, 0, 0});
 }
-/// Writes zeros behind d_head, where nothing is copied to.
+/// Writes zeros to the columns from d_head on, which no copy writes.
 template <class S>
 VLA_DEVICE void clear_columns(int d_head, int n_row, std::byte* to) {
   if (S::copied_column() >= d_head && S::copied_column() < S::kDepth) clear_rows<S>(0, n_row, to);
 }
 
-/// Copies a tile's keys or values to shared memory, which lie in one segment after the other.
+/// Copies tiles of keys or values to shared memory, from one segment after the other.
 template <class S, HeadRows AttentionJob::Segment::*kWhich>
 class Reader {
  public:
   VLA_DEVICE Reader(const AttentionJob& job, const Unit& unit) : job_(job), unit_(unit) { enter(0); }
 
-  /// Rows of keys `first` to last - 1, as many as a tile has, and zeros behind them.
+  /// Copies the rows of keys `first` to last - 1, at most a tile of them, and writes zeros after them.
   VLA_DEVICE void fetch(int first, int last, std::byte* to) {
     const int n = last - first < S::kKeys ? last - first : S::kKeys;
     for (int end = 0; end < n;) {
@@ -72,7 +72,7 @@ class Reader {
     segment_ = segment, begin_ = end_, end_ += job_.segment[segment].n_key, token_ = rows.token;
     from_ = row_of<std::uint16_t>(rows, unit_.head_kv, 0, unit_.batch);
   }
-  /// Rows `begin` to end - 1 of a tile. `from` is where its first row would be.
+  /// Copies rows `begin` to end - 1 of a tile. `from` is the address of row 0, even if the segment has no such row.
   VLA_DEVICE void copy(int begin, int end, const std::uint16_t* from, std::byte* to) const {
     const int row = S::copied_row(), column = S::copied_column();
     if (column >= job_.d_head) return;
@@ -89,7 +89,7 @@ class Reader {
   int segment_ = 0, begin_ = 0, end_ = 0;
 };
 
-/// Copies a block's rows of queries, and zeros behind the last.
+/// Copies a block's rows of queries and writes zeros after the last.
 template <class S>
 VLA_DEVICE void fetch_queries(const AttentionJob& job, const Unit& unit, int row0, std::byte* to) {
   const int column = S::copied_column(), group = job.group();
@@ -108,9 +108,9 @@ VLA_DEVICE void fetch_queries(const AttentionJob& job, const Unit& unit, int row
   }
 }
 
-/// A warp's part of a block's work. Sums 0 and 1 of a lane belong to row lane / 4 of its 16, sums 2 and 3 to row lane /
-/// 4
-/// + 8.
+/// A warp's part of a block's work.
+/// The warp has 16 rows. Sums 0 and 1 of a lane belong to row lane / 4, sums 2 and 3 to row lane / 4 + 8. These are the
+/// halves h = 0 and h = 1 of the rows.
 template <class S>
 class Warp {
  public:
@@ -128,7 +128,7 @@ class Warp {
   VLA_DEVICE static int row_group() { return thread_index() / kLanes % S::kRowGroups; }
   VLA_DEVICE static int key_group() { return thread_index() / kLanes / S::kRowGroups; }
 
-  /// Scores of keys of the tile from `first` on begin with the mask, and with minus infinity from key `last` on.
+  /// Initializes the scores of the tile that begins at key `first`: mask or 0, and minus infinity from key `last` on.
   VLA_DEVICE void begin_scores(int first, int last) {
     const int key = key_group() * S::kOwnKeys + lane() % 4 * 2, n_key = last - first - key;
     if (job_.mask == nullptr) {
@@ -139,7 +139,7 @@ class Warp {
       each_score([&](float& one, int h, int at) { one = at < n_key ? mask[h][at] : kMinusInfinity; });
     }
   }
-  /// The mask as scores are before they are scaled; apart, so that its values come meanwhile.
+  /// Divides the mask by the scale, which scores get later. A separate step gives the mask's loads time to finish.
   VLA_DEVICE void unscale_mask() {
     const float unit = 1 / job_.scale;
     if (job_.mask != nullptr) each_score([&](float& one, int, int) { one *= unit; });
@@ -169,7 +169,7 @@ class Warp {
     }
     if constexpr (S::kScoreSums > 1) add(scores_, odd);
   }
-  /// The largest score so far of each row, among this warp's keys of the tile.
+  /// Computes each row's largest score so far, including this warp's keys of the tile.
   VLA_DEVICE void find_most(float (&most)[2]) const {
 #pragma unroll
     for (int h = 0; h < 2; ++h) {
@@ -181,7 +181,7 @@ class Warp {
       most[h] = fmaxf(most[h], dev::shuffle_xor(most[h], 2));
     }
   }
-  /// What was summed is weighed anew where the largest score grows to `most`.
+  /// Rescales the sums of rows whose largest score grows to `most`.
   VLA_DEVICE void shrink_to(const float (&most)[2]) {
     const float scale = job_.scale * kLog2;
 #pragma unroll
@@ -194,7 +194,7 @@ class Warp {
         for (int n = 0; n < S::kTiles; ++n) y_[s][n][2 * h] *= factor, y_[s][n][2 * h + 1] *= factor;
     }
   }
-  /// Weights of this warp's keys, for `take`(tile of 8 keys, row's half, two of bf16).
+  /// Computes the weights of this warp's keys and calls take(tile of 8 keys, half of the rows, two bf16 weights).
   template <class Take>
   VLA_DEVICE void weigh(Take take) {
     const float scale = job_.scale * kLog2;
@@ -210,7 +210,7 @@ class Warp {
       }
     }
   }
-  /// y += weights * v, for 16 keys; `v` is where this lane's row of them begins.
+  /// y += weights * v, for 16 keys; `v` points to this lane's row of the values.
   VLA_DEVICE void add_values(const unsigned (&weights)[4], const std::byte* v) {
 #pragma unroll
     for (int n = 0; n < S::kTiles; n += 2) {
@@ -220,7 +220,7 @@ class Warp {
       dev::multiply_bf16(y_[0][n + 1], weights, b[2], b[3]);
     }
   }
-  /// The tile's values, of weights in registers.
+  /// Adds the tile's values, with weights in registers.
   VLA_DEVICE void add_values_alone(const std::byte* v) {
     unsigned weights[S::kOwnKeys / 16][4];  // in the order of operand a
     weigh([&](int n, int h, unsigned pair) { weights[n / 2][n % 2 * 2 + h] = pair; });
@@ -232,7 +232,7 @@ class Warp {
     to += (row_group() * 16 + lane() / 4) * S::weight_row() + (key_group() * S::kOwnKeys + lane() % 4 * 2) * 2;
     weigh([&](int n, int h, unsigned pair) { dev::write(to + h * 8 * S::weight_row() + n * 16, pair); });
   }
-  /// The tile's values in this warp's columns, of weights that all warps left. 64 keys without one are left out.
+  /// Adds the tile's values in this warp's columns, with all warps' weights. Skips groups of 64 keys after `n_key`.
   VLA_DEVICE void add_values_shared(const std::byte* weights, const std::byte* v, int n_key) {
     weights += (row_group() * 16 + lane() % 16) * S::weight_row() + lane() / 16 * 16;
     v += key_group() * S::kTiles * 16;
@@ -258,8 +258,8 @@ class Warp {
     }
   }
 
-  /// Every warp of a row group gets what `combine` makes of their values, through a float for each row and key group.
-  /// All threads of the block come to its barrier.
+  /// Combines the values of a row group's warps; every warp gets the result. `room`: a float per row and key group.
+  /// All threads of the block must call it, because it has a barrier.
   template <class Combine>
   VLA_DEVICE void across_groups(float (&values)[2], std::byte* room, Combine combine) const {
     room += (row_group() * 16 + lane() / 4) * 4;
@@ -287,7 +287,7 @@ class Warp {
   }
 
  private:
-  /// change(score, row's half, key behind the lane's first)
+  /// Calls change(score, half of the rows, key minus the lane's first key) for each score.
   template <class Change>
   VLA_DEVICE void each_score(Change change) {
 #pragma unroll
@@ -329,13 +329,13 @@ class Warp {
   const AttentionJob& job_;
   const Unit& unit_;
   int row0_;
-  const float* mask_[2] = {};  // of a lane's rows
+  const float* mask_[2] = {};  // the mask's rows for the lane's two rows
   unsigned q_[S::kKeepsQ ? S::kSteps : 1][4] = {};
   float scores_[S::kOwnKeys / 8][4], y_[S::kSums][S::kTiles][4] = {};
   float most_[2] = {kMinusInfinity, kMinusInfinity}, total_[2] = {};
 };
 
-/// Each warp takes all keys for its rows; the next tile comes while one is computed.
+/// Each warp takes all keys for its rows. The next tile is copied while one is computed.
 template <class S>
 VLA_DEVICE void attend_alone(const AttentionJob& job) {
   std::byte *q = dev::shared_memory(), *stages = q + S::kRows * S::kRow;
@@ -376,8 +376,8 @@ VLA_DEVICE void attend_alone(const AttentionJob& job) {
   warp.finish(nullptr);
 }
 
-/// Warps share a tile's keys, then the elements of the result. Keys of the next tile come while values are multiplied,
-/// values while scores are computed.
+/// Warps divide a tile's keys among them, then the columns of the result. The next tile's keys are copied while values
+/// are multiplied, and a tile's values while its scores are computed.
 template <class S>
 VLA_DEVICE void attend_shared(const AttentionJob& job) {
   std::byte *q = dev::shared_memory(), *k = q + S::kRows * S::kRow, *v = k + S::kTile;
@@ -402,7 +402,7 @@ VLA_DEVICE void attend_shared(const AttentionJob& job) {
       dev::wait_copies<1>();
     else
       dev::wait_copies<0>();
-    __syncthreads();  // keys are visible to all threads, which have read the values before
+    __syncthreads();  // keys are visible to all threads, and all have read the previous tile's values
     if (!is_first) {
       values.fetch(first, share.last, v);
       dev::commit_copies();

@@ -25,8 +25,8 @@ struct AttentionJob {
   Segment segment[kMaxSegment];
   const float* mask;  // [n_key, n_query], any values except +infinity, or null
   void* y;            // [d_head, n_head, n_query, n_batch], float32 or bf16
-  /// With more than one split, of kMaxAttentionSplit, each takes a share of the keys. Sums of values, and for every row
-  /// its largest score and sum of weights, go to partial [d_head + 2, n_row, n_head_kv * n_batch, n_split];
+  /// With more than one split, at most kMaxAttentionSplit, each split takes a share of the keys. It writes each row's
+  /// sums of values, largest score and sum of weights to partial [d_head + 2, n_row, n_head_kv * n_batch, n_split];
   /// `finish_attention` computes y from them.
   float* partial;
   float scale;
@@ -41,12 +41,12 @@ struct AttentionJob {
 constexpr int kMaxHead = 256;
 constexpr int kMaxAttentionSplit = 32;
 
-/// A block of a kernel on tensor cores: `rows` rows of queries, 16 of each warp, and a tile of `keys` keys at a time.
-/// One key group: a warp takes all keys of a tile, and the next tile comes meanwhile. More: warps share the keys while
-/// they compute scores, then the elements of the result, for few rows.
+/// The block of a kernel on tensor cores: `rows` rows of queries, 16 per warp, and `keys` keys per tile. With one key
+/// group, a warp takes all keys of a tile while the next tile is copied. With more, meant for few rows, warps divide
+/// the keys among them to compute scores, then the columns of the result.
 struct AttentionShape {
   const char* kernel;
-  int depth;  // of heads, at most
+  int depth;  // the largest d_head
   int rows, key_groups, keys;
 
   constexpr int n_thread() const { return rows / 16 * key_groups * 32; }

@@ -16,7 +16,7 @@ VLA_DEVICE void store_y(const AttentionJob& job, const Unit& unit, int row, int 
 template <int kKeys>
 struct Tiles {
   const AttentionJob& job;
-  // the tile's segment, its first key in it, number of keys in earlier segments
+  // the tile's segment, its first key within the segment, the keys in earlier segments, the tile's index
   int segment = 0, first = 0, before = 0, number = 0;
 
   VLA_DEVICE explicit Tiles(const AttentionJob& of) : job(of) {
@@ -108,7 +108,7 @@ VLA_KERNEL(attention_f32, 256, 2, AttentionJob) {
 
 /// Combines the partial sums of a split; a warp computes 64 elements of a row. Lane z weighs share z.
 VLA_KERNEL(attention_finish, 128, 4, AttentionJob) {
-  constexpr int kAtOnce = 16;  // shares that are on their way at a time
+  constexpr int kAtOnce = 16;  // shares whose loads are in flight at a time
   const int lane = thread_index() % kLanes, n_part = (job.d_head + 63) / 64;
   const int warp = static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes, row = warp / n_part;
   const Unit unit(job);

@@ -5,7 +5,7 @@
 #include "cuda/kernels/attention.h"
 #include "cuda/kernels/device.h"
 
-/// What the kernels of attention share: which rows a block has, and where they lie.
+/// Shared by the attention kernels: the rows of a block and their addresses.
 namespace vla::cuda {
 
 constexpr float kLog2 = 1.4426950408889634f;
@@ -41,7 +41,7 @@ VLA_DEVICE float* partial_row(const AttentionJob& job, int row, int split) {
   const std::int64_t unit = static_cast<std::int64_t>(split) * job.n_head_kv * job.n_batch + blockIdx.y;
   return job.partial + (unit * job.n_row() + row) * (job.d_head + 2);
 }
-/// Where a row of y begins.
+/// The index in y of a row's first element.
 VLA_DEVICE std::int64_t y_row(const AttentionJob& job, const Unit& unit, int row) {
   const std::int64_t token = static_cast<std::int64_t>(unit.batch) * job.n_query + query_of(job, row);
   return (token * job.n_head + head_of(job, unit, row)) * job.d_head;

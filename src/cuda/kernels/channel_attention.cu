@@ -9,7 +9,7 @@
 namespace vla::cuda {
 namespace {
 
-constexpr float kLogOfE = 1.44269504f;  // to base 2
+constexpr float kLogOfE = 1.44269504f;  // log2(e)
 
 /// The score of query feature i and key feature j over all tokens. Products are summed over 64 tokens before they are
 /// added to the total; thousands of single additions would cost a digit.

@@ -20,7 +20,7 @@ struct ChannelAttentionJob {
   VLA_HOST_DEVICE int d_group() const { return d / n_group; }
 };
 
-/// A thread computes scores of one query feature, later tokens of it.
+/// The block's threads divide the group's scores among them, then the elements of y.
 inline Launch channel_attention(const ChannelAttentionJob& job) {
   const unsigned d = static_cast<unsigned>(job.d_group());
   return {"channel_attention", {static_cast<unsigned>(job.n_group), static_cast<unsigned>(job.n_view)}, 256, d * d * 4};

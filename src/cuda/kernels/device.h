@@ -21,8 +21,8 @@
     name##_body(job);                               \
   }                                                 \
   VLA_DEVICE void name##_body(const Job& job)
-/// The same for one that itself calls wait_for_earlier(), and before it reads nothing but weights and writes nothing,
-/// and let_next_begin().
+/// The same for a kernel that calls wait_for_earlier() and let_next_begin() itself. Before wait_for_earlier() it may
+/// read only weights and must not write.
 #define VLA_EARLY_KERNEL(name, threads, blocks, Job) \
   extern "C" __global__ void __launch_bounds__(threads, blocks) name(const __grid_constant__ Job job)
 
@@ -33,16 +33,16 @@ VLA_DEVICE std::byte* shared_memory() {
   extern __shared__ __align__(1024) std::byte bytes[];
   return bytes;
 }
-/// Waits for the stream's kernel before this one, with all that it wrote. Every thread must call it before it reads
-/// results of kernels or writes. Before Hopper kernels do not overlap.
+/// Waits until the stream's previous kernel has ended and its writes are visible. Every thread must call it before it
+/// reads results of kernels or writes. On devices before Hopper, kernels do not overlap.
 VLA_DEVICE void wait_for_earlier() {
 #if __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
-/// The stream's next kernel may begin, up to its own wait_for_earlier(), once all blocks of this one have called it.
-/// Kernels of many blocks call it when little is left to do: blocks of the next one crowd together where others have
-/// ended already.
+/// Once all blocks have called it, the stream's next kernel may begin and run up to its wait_for_earlier().
+/// A kernel of many blocks calls it when little is left to do, because the next kernel's blocks crowd onto the
+/// multiprocessors that become free first.
 VLA_DEVICE void let_next_begin() {
 #if __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
@@ -157,7 +157,7 @@ namespace vla::cuda {
 
 constexpr int kLanes = 32;
 
-/// Calls run(job, block of the job) for the job that has this block.
+/// Calls run(job, block within the job) for the job that `block` belongs to.
 template <class Job, int kMost, class Run>
 VLA_DEVICE void run_one(const Several<Job, kMost>& jobs, unsigned block, Run run) {
   int i = 0;
@@ -167,7 +167,7 @@ VLA_DEVICE void run_one(const Several<Job, kMost>& jobs, unsigned block, Run run
 
 VLA_DEVICE int thread_index() { return static_cast<int>(threadIdx.x); }
 VLA_DEVICE float from_bf16(std::uint16_t bits) { return dev::float_of(static_cast<int>(bits) << 16); }
-/// Element `at` of an array of bf16 or float32.
+/// Stores element `at` of an array of bf16 or float32.
 VLA_DEVICE void store(void* y, bool is_bf16, std::int64_t at, float value) {
   if (is_bf16)
     static_cast<std::uint16_t*>(y)[at] = static_cast<std::uint16_t>(dev::to_bf16(value, 0));
@@ -175,7 +175,7 @@ VLA_DEVICE void store(void* y, bool is_bf16, std::int64_t at, float value) {
     static_cast<float*>(y)[at] = value;
 }
 
-/// Elements `at`, which is even, and at + 1.
+/// Stores elements `at`, which must be even, and at + 1.
 VLA_DEVICE void store_pair(void* y, bool is_bf16, std::int64_t at, float low, float high) {
   if (is_bf16)
     *reinterpret_cast<unsigned*>(static_cast<std::uint16_t*>(y) + at) = dev::to_bf16(low, high);
@@ -183,7 +183,7 @@ VLA_DEVICE void store_pair(void* y, bool is_bf16, std::int64_t at, float low, fl
     *reinterpret_cast<float2*>(static_cast<float*>(y) + at) = {low, high};
 }
 
-/// Reduces over the lanes of a warp, with the result in all of them, in the same order everywhere.
+/// Reduces over the lanes of a warp in a fixed order. All lanes get the same result.
 VLA_DEVICE float sum_of_warp(float x) {
   for (int mask = 16; mask > 0; mask /= 2) x += dev::shuffle_xor(x, mask);
   return x;

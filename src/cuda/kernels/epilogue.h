@@ -9,14 +9,14 @@ namespace vla::cuda {
 
 constexpr int kMostSplits = 8;  // shares of the depth that a kernel adds at once
 
-/// What follows a product's sums: y = activation(sum + bias) * factor + residual, or the ReLU of that; with a gate y =
-/// activation(gate) * (sum + bias) * factor + residual. All operands except y may be null.
+/// Computes y from a product's sums: y = activation(sum + bias) * factor + residual, or the ReLU of that. With a gate,
+/// y = activation(gate) * (sum + bias) * factor + residual. All operands except y may be null.
 struct Epilogue {
   const float* bias;      // [n_column]
   const float* factor;    // [n_column]
   const float* gate;      // [n_column, n_row]
   const float* residual;  // [n_column, n_row]
-  void* y;                // rows with a stride of y_stride elements, of which n_column are written
+  void* y;                // rows of n_column elements with a stride of y_stride elements
   std::int64_t y_stride;
   Activation activation;
   bool is_bf16;  // whether y is bf16, else float32

@@ -7,8 +7,8 @@
 
 namespace vla::cuda {
 
-/// Operands that change nothing, in the place of those that an epilogue lacks: x + -0 is x, for zeros of both signs
-/// too.
+/// Neutral operands, which replace those that an epilogue lacks. x + -0 is x for every x, also for zeros of both
+/// signs.
 constexpr float kAddsNothing = -0.0f, kScalesNothing = 1;
 
 VLA_DEVICE bool is_sigmoid(Activation activation) {
@@ -23,20 +23,20 @@ VLA_DEVICE float activate_otherwise(Activation activation, float x) {
   if (activation == Activation::relu) return x < 0 ? 0 : x;
   if (activation == Activation::relu_squared) return x < 0 ? 0 : x * x;
   if (activation == Activation::gelu_erf) return 0.5f * x * (1 + erff(0.70710678f * x));
-  // mish, as kernels/math.h
+  // mish, as in kernels/math.h
   const float t = expf(-fabsf(x)), above = x < 0 ? t * (t + 2) : 1 + 2 * t;
   return x * (above * dev::reciprocal(above + (x < 0 ? 2 : 2 * t * t)));
 }
 /// Within a few units in the last place. Written without a switch, because nvcc would build a jump table at every use.
-/// A division has a branch of its own, which an epilogue's many values would take one after the other. Sources: torch
-/// silu, gelu, relu, mish.
+/// Uses a reciprocal, because a division branches, and an epilogue's many values would branch one after the other.
+/// Sources: torch silu, gelu, relu, mish.
 VLA_DEVICE float activate(Activation activation, float x) {
   if (activation == Activation::none) return x;
   return is_sigmoid(activation) ? activate_by_sigmoid(activation, x) : activate_otherwise(activation, x);
 }
 
-/// Calls run(activate) for the activations of most networks, compiled for each of them, or otherwise(activate).
-/// Skipped instructions still pass through the instruction cache, and fetching them costs more than a value's work.
+/// Calls run(activate), compiled separately for each kind of activation that most networks use, or otherwise(activate).
+/// Shared code would skip instructions; those are fetched nevertheless, which costs more than computing a value.
 template <class Run, class Otherwise>
 VLA_DEVICE void with_activation(Activation activation, Run run, Otherwise otherwise) {
   if (activation == Activation::none)
@@ -47,7 +47,7 @@ VLA_DEVICE void with_activation(Activation activation, Run run, Otherwise otherw
     otherwise([=](float x) { return activate_otherwise(activation, x); });
 }
 
-/// Four adjacent elements of a row, of which n are there; together: they are aligned to their size, and all there.
+/// Four adjacent elements of a row; the first n exist. `together`: all four exist and are aligned to their total size.
 struct Four {
   float of[4];
 };
@@ -84,7 +84,7 @@ VLA_DEVICE void store_four(std::uint16_t* to, const Four& from, bool together, i
   }
 }
 
-/// What an epilogue reads for two adjacent columns of a row, so that it can be asked for before the sums are there.
+/// An epilogue's operands for two adjacent columns of a row, which are loaded before the sums are ready.
 struct PairEnds {
   float2 bias = {kAddsNothing, kAddsNothing}, factor = {kScalesNothing, kScalesNothing}, gate = {0, 0};
   float2 residual = {kAddsNothing, kAddsNothing};
@@ -108,7 +108,7 @@ VLA_DEVICE PairEnds load_ends(const Epilogue& e, std::int64_t row, int column, i
   return ends;
 }
 
-/// y of one sum, where activate(x) is the activation. Products and sums are not fused, so y without an activation
+/// Computes y from one sum; activate(x) is the activation. Products and sums are not fused, so y without an activation
 /// equals the CPU's to the bit.
 template <class Activate>
 VLA_DEVICE float finish(const Epilogue& e, bool has_gate, float sum, float bias, float factor, float gate,
@@ -120,7 +120,7 @@ VLA_DEVICE float finish(const Epilogue& e, bool has_gate, float sum, float bias,
   return e.ends_in_relu && sum < 0 ? 0 : sum;
 }
 
-/// Writes y of four adjacent columns from `column` on, of which n are there.
+/// Writes y of four adjacent columns from `column` on; the first n exist.
 VLA_DEVICE void store_y(const Epilogue& e, std::int64_t row, int column, const Four& y, bool together, int n) {
   const std::int64_t at = row * e.y_stride + column;
   if (e.is_bf16) return store_four(static_cast<std::uint16_t*>(e.y) + at, y, together, n);
@@ -130,13 +130,13 @@ VLA_DEVICE void store_y(const Epilogue& e, std::int64_t row, int column, const F
   store_four(static_cast<unsigned*>(e.y) + at, words, together, n);
 }
 
-/// Whether what an epilogue reads and writes consists of aligned fours.
+/// Whether all operands of an epilogue, and y, consist of aligned fours.
 VLA_DEVICE bool is_of_fours(const Epilogue& e, int n_column) {
   const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
   const auto all = bits(e.bias) | bits(e.factor) | bits(e.gate) | bits(e.residual) | bits(e.y);
   return (n_column | e.y_stride) % 4 == 0 && all % 16 == 0;
 }
-/// y of four adjacent sums from `column` on, with a gate if has_gate.
+/// Computes and stores y of four adjacent sums from `column` on, with a gate if has_gate.
 template <bool kTogether>
 VLA_DEVICE void finish_four(const Epilogue& e, int row, int column, int n_column, const Four& sum, bool has_gate,
                             const Four& gate) {

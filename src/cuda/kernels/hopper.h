@@ -4,18 +4,18 @@
 
 #include "cuda/kernels/device.h"
 
-/// Products of a warpgroup (four warps in a row, the first a multiple of four), for files that are compiled for sm_90a
-/// alone. For the host's compiler tests/cuda/emulation.h has the same functions. Source: PTX ISA 9.0, "Asynchronous
+/// Products of a warpgroup (four consecutive warps from a multiple of four on), for files that are compiled only for
+/// sm_90a. For the host's compiler tests/cuda/emulation.h has the same functions. Source: PTX ISA 9.0, "Asynchronous
 /// Warpgroup Level Matrix Multiply-Accumulate Instructions".
 #ifdef __CUDACC__
 
 namespace vla::cuda::dev {
 
-/// Makes this thread's writes to shared memory, also by copies that it has waited for, visible to wgmma. A barrier must
-/// follow before another thread's wgmma reads them.
+/// Makes this thread's writes to shared memory visible to wgmma, also those of copies that it has waited for. A barrier
+/// must follow before another thread's wgmma reads them.
 VLA_DEVICE void fence_async_proxy() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
 
-/// Comes before the first wgmma, and before those after sums were read or written by other instructions.
+/// Must precede the first wgmma, and each wgmma after other instructions have read or written the sums.
 VLA_DEVICE void wgmma_fence() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }
 VLA_DEVICE void wgmma_commit() { asm volatile("wgmma.commit_group.sync.aligned;" ::: "memory"); }
 /// Waits until all but the latest kLeft groups of this warpgroup have ended: then their operands may be overwritten.
@@ -37,7 +37,7 @@ VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
 }
 
 // clang-format off
-// Registers %0 to %(n - 1), and sums as operands of these.
+// VLA_Rn names registers %0 to %(n - 1); VLA_Sn lists the sums as operands for these registers.
 #define VLA_R8 "%0, %1, %2, %3, %4, %5, %6, %7"
 #define VLA_R16 VLA_R8 ", %8, %9, %10, %11, %12, %13, %14, %15"
 #define VLA_R24 VLA_R16 ", %16, %17, %18, %19, %20, %21, %22, %23"
@@ -71,7 +71,7 @@ VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
 #define VLA_S112(c) VLA_S104(c), VLA_SUMS(c, 104)
 #define VLA_S120(c) VLA_S112(c), VLA_SUMS(c, 112)
 #define VLA_S128(c) VLA_S120(c), VLA_SUMS(c, 120)
-// half: n / 2, the number of sums of a thread; pa, pb, pp: the numbers of the operands behind them.
+// half: n / 2, the number of a thread's sums and of operand a, which follows them; pb, pp: numbers of operands b, adds.
 #define VLA_WGMMA(n, half, pb, pp, shape, tail, c)                                                     \
   if constexpr (kN == n)                                                                               \
     asm volatile("{\n.reg .pred adds;\nsetp.ne.b32 adds, %" #pp ", 0;\n"                               \
@@ -94,9 +94,9 @@ VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
   VLA_WGMMA(256, 128, 129, 130, shape, tail, c)
 // clang-format on
 
-/// sum[64, kN] (+)= a[64, 16] * b[kN, 16]^T of bf16 with sums in float32, without the old sums unless it adds.
-/// Descriptors name a and b in shared memory. Of 16 rows of each warp, register 4 j + 2 h + c of lane l is row l / 4 +
-/// 8 h, column 8 j + 2 (l % 4) + c.
+/// sum[64, kN] (+)= a[64, 16] * b[kN, 16]^T of bf16 with sums in float32; `adds` keeps the old sums.
+/// a and b are descriptors of shared memory. Each warp has 16 rows of the sums; register 4 j + 2 h + c of lane l is
+/// row l / 4 + 8 h of these, column 8 j + 2 (l % 4) + c.
 template <int kN>
 VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
   static_assert(kN % 16 == 0 && kN >= 64 && kN <= 256);
@@ -116,12 +116,12 @@ VLA_DEVICE void wgmma_s8(int (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, b
 
 namespace vla::cuda {
 
-/// Operands of wgmma are rows of 128 bytes of the depth, eight to 1024 bytes at a multiple of that, with the 16-byte
-/// chunks of a row permuted by its number: swizzling over 128 bytes.
+/// Operands of wgmma are rows of 128 bytes of the depth. Eight rows take 1024 bytes and are aligned to 1024 bytes.
+/// The 16-byte chunks of a row are permuted by the row's number: swizzling over 128 bytes.
 constexpr int kSwizzledRow = 128, kSwizzledRows = 8;
 VLA_DEVICE int swizzled(int row, int chunk) { return row * kSwizzledRow + (chunk ^ row % kSwizzledRows) * 16; }
 
-/// The matrix descriptor of such rows. To go on by k bytes of the depth, add k / 16.
+/// The matrix descriptor of such rows. To advance by k bytes of the depth, add k / 16.
 VLA_DEVICE std::uint64_t swizzled_descriptor(const std::byte* rows) {
   constexpr std::uint64_t kSwizzle128 = std::uint64_t{1} << 62, kStride = kSwizzledRow * kSwizzledRows / 16;
   return (dev::shared_address(rows) & 0x3ffffU) >> 4 | std::uint64_t{1} << 16 | kStride << 32 | kSwizzle128;

@@ -16,9 +16,9 @@ struct Tile {
   static_assert(hopper_int8_shared(kKind, kColumns, kRows) <= static_cast<int>(kHopperShared));
 };
 
-/// Codes of a step, for which each warp brings one tile of the packed matrix to shared memory: warp w of a tile of
-/// columns w / 2, half w % 2 of the step. They become rows of bytes, as wgmma reads them: the words of a lane are four
-/// of the depth of each of its columns, so that a warp writes to all banks.
+/// The codes of a step. Each warp copies one tile of the packed matrix to shared memory: warp w the tile of columns
+/// w / 2, half w % 2 of the step. It unpacks the tile to rows of bytes, as wgmma reads them. A word of a lane has four
+/// elements along the depth of one of its columns, so a warp writes to all banks.
 template <CodeKind kKind>
 class Codes {
  public:
@@ -36,7 +36,7 @@ class Codes {
     for (int i = 0; i < kTileBytes<kKind>; i += 512)
       dev::copy_async(packed + warp() * kTileBytes<kKind> + i + lane() * 16, from + i, valid ? 16 : 0);
   }
-  /// Each thread reads only what it brought itself.
+  /// Each thread reads only the bytes that it copied itself.
   VLA_DEVICE void unpack(const std::byte* packed, std::byte* rows) const {
     packed += warp() * kTileBytes<kKind>;
     const LaneCodes<kKind> codes([&](auto type, int at) { return dev::read<decltype(type)>(packed + at); });
@@ -55,7 +55,7 @@ class Codes {
   }
 
   const std::byte* from_;
-  int n_tile_;  // of the depth
+  int n_tile_;  // tiles along the depth
   bool is_there_;
 };
 
@@ -70,7 +70,7 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   const FetchRows<T::kRows, T::kThreads> fetch_x(job.x, job.x_stride, row0, job.n_row, job.depth);
   const Codes<T::kKind> codes(job, column0);
 
-  // Codes of a step come together with x of the step before, since they are unpacked a step ahead.
+  // A step's codes are copied together with the previous step's x, because they are unpacked a step ahead.
   codes.fetch(packed + (T::kStages - 1) * kPacked, first);
   dev::commit_copies();  // commits a group even if it is empty, because waiting counts groups
 #pragma unroll
@@ -119,7 +119,7 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   End::place(sum, shared);
   __syncthreads();
   const End end(job, nullptr, row0, column0);
-  // Ternary codes are stored plus 1: the first share of the depth subtracts what that adds.
+  // Ternary codes are stored plus 1, which adds the row's sum of codes; the first share of the depth subtracts it.
   const auto exact = [&](int sum_of_row, unsigned bits) {
     return static_cast<int>(bits) - (T::kKind == CodeKind::ternary && z == 0 ? sum_of_row : 0);
   };

@@ -5,13 +5,13 @@
 #include "cuda/kernels/finish.h"
 #include "cuda/kernels/hopper.h"
 
-/// What products in tiles for Hopper share. A block computes kColumns x kRows sums: y transposed, since the second size
-/// of a warpgroup's product may be any multiple of 16, and rows are fewer than columns. Each warpgroup has 64 columns
-/// of y and all rows.
+/// Shared by the tiled products for Hopper. A block computes kColumns x kRows sums, y transposed: rows are fewer than
+/// columns, and the second size of a warpgroup's product may be any multiple of 16. Each warpgroup has 64 columns of y
+/// and all rows.
 namespace vla::cuda {
 
-/// Copies a step of 128 bytes of the depth of kRows rows to swizzled rows, eight threads a row, padded with zeros after
-/// the last row and the depth. Strides and depth are in bytes.
+/// Copies a step, 128 bytes of the depth, of kRows rows to swizzled rows, with eight threads per row. Pads with zeros
+/// after the last row and after the depth. Strides and depth are in bytes.
 template <int kRows, int kThreads>
 class FetchRows {
  public:
@@ -36,14 +36,14 @@ class FetchRows {
  private:
   static constexpr int kRowsAtOnce = kThreads / 8;
   static_assert(kRowsAtOnce % kSwizzledRows == 0);
-  const std::byte* from_;  // of this thread's first row; nothing is read where a copy's size is 0
+  const std::byte* from_;  // this thread's chunk of its first row; a copy of size 0 reads nothing
   std::int64_t stride_;
   int n_left_, depth_, to_;
 };
 
-/// The end of a tile, whose sums pass through shared memory, where rows of y have kColumns words and four more against
-/// bank conflicts. A thread has the same four columns of every few rows. Gated: the first half of a row are sums of the
-/// gate's matrix, the second those of the same columns of the other.
+/// The end of a tile. Its sums pass through shared memory, in rows of kColumns words and four more against bank
+/// conflicts. A thread finishes the same four columns of every kRowsAtOnce-th row. Gated: the first half of a row holds
+/// the sums of the gate's matrix, the second half the other matrix's sums of the same columns.
 template <int kColumns, int kRows, bool kGated>
 class TileEnd {
  public:
@@ -73,8 +73,8 @@ class TileEnd {
     }
   }
 
-  /// Leaves word(of_row(row), sum), as bits, to the share of the depth that begins at `partial`, whose rows have the
-  /// gate's sums first.
+  /// Stores word(of_row(row), bits of a sum) to the partial sums of one share of the depth, which begin at `partial`.
+  /// In each row the gate's sums come first.
   template <class OfRow, class Word>
   VLA_DEVICE void leave(const std::byte* sums, void* partial, OfRow of_row, Word word) const {
     if (together_)
@@ -82,7 +82,7 @@ class TileEnd {
     else
       leave_rows<1, false>(sums, partial, of_row, word);
   }
-  /// Computes y of value(of_row(row), bits of a sum, which of the four columns).
+  /// Computes y from value(of_row(row), bits of a sum, index of the column among the thread's four).
   template <class OfRow, class Value>
   VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value) const {
     const auto one = [&](auto activate) { finish_rows<1, false>(sums, of_row, value, activate); };
@@ -114,7 +114,7 @@ class TileEnd {
         }
       }
   }
-  /// The same for one activation. Loads of kRowsAhead rows are under way at a time.
+  /// Implements `finish` for one activation. Loads of kRowsAhead rows are in flight at a time.
   template <int kRowsAhead, bool kTogether, class OfRow, class Value, class Activate>
   VLA_DEVICE void finish_rows(const std::byte* sums, OfRow of_row, Value value, Activate activate) const {
     const auto load = [&](const float* from, std::int64_t at, float otherwise) {
@@ -163,7 +163,7 @@ class TileEnd {
 
   const Epilogue& e_;
   const float* gate_bias_;
-  int row0_, n_column_, column_, n_, end_;  // n: columns from column on; end: rows of the tile
+  int row0_, n_column_, column_, n_, end_;  // n_: columns from column_ on; end_: rows to finish
   bool together_;
 };
 

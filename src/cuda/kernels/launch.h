@@ -11,7 +11,7 @@ struct Grid {
   unsigned x = 1, y = 1, z = 1;
 };
 
-/// A kernel's name and launch configuration. Its one parameter is the job that the header defines.
+/// A kernel's name and launch configuration. A kernel's only parameter is the job that its header defines.
 struct Launch {
   const char* kernel;
   Grid grid;
@@ -33,8 +33,8 @@ constexpr unsigned kHopperShared = 227 << 10;
 /// Most blocks of a grid in y and z.
 constexpr unsigned kMaxGridYZ = 65535;
 
-/// Up to so many jobs of one kernel in one launch; blocks of a job end, in x or for Hopper's tiles in y, where the next
-/// one's begin.
+/// The most jobs of one kernel in one launch. The jobs' blocks follow each other in x, for Hopper's tiles in y:
+/// `end` of a job is the first block of the next.
 constexpr int kMostJobs = 3;
 template <class Job, int kMost = kMostJobs>
 struct Several {
@@ -43,7 +43,7 @@ struct Several {
   int n;
 };
 
-/// Writes where the blocks of each job end, n_block(job) for each. Returns the number of all.
+/// Sets `end` of each job, which has n_block(job) blocks. Returns the number of all blocks.
 template <class Job, int kMost, class Count>
 unsigned fill_ends(Several<Job, kMost>& jobs, Count n_block) {
   unsigned end = 0;

@@ -100,7 +100,7 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
   });
 }
 
-/// Elements k to k + 7 of a row, zeros from `end` on. `is_aligned`: every row is aligned to 16 bytes.
+/// Loads elements k to k + 7 of a row, zeros from `end` on. `is_aligned`: every row is aligned to 16 bytes.
 VLA_DEVICE void eight(const float* row, int k, int end, bool is_aligned, float (&to)[8]) {
   if (is_aligned && k + 8 <= end) {
 #pragma unroll
@@ -167,8 +167,8 @@ VLA_KERNEL(linear_bf16_few, 128, 4, LinearBf16Job) { multiply_few(job); }
 
 namespace {
 
-/// Four adjacent sums of all shares of the depth, of which n are there, from column `at` of a row of them on, added in
-/// order. kTogether: all are there and aligned, and shares are kMostSplits at most, all of which are asked for at once.
+/// Adds four adjacent sums over all shares of the depth, in order, from column `at` of a row of sums on; the first n
+/// exist. kTogether: all four exist and are aligned, and there are at most kMostSplits shares, loaded at once.
 template <bool kTogether>
 VLA_DEVICE Four add_shares(const LinearBf16Job& job, int row, int at, int n) {
   const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * job.n_sum();

@@ -15,22 +15,22 @@ struct LinearBf16Job {
   const std::uint16_t* weight;  // n_column rows with stride weight_stride, a multiple of 8
   std::int64_t x_stride, weight_stride;
   int n_row, n_column, depth;  // elements of a row after the depth are ignored
-  /// With more than one split, sums over a share of the depth go to partial [n_column, n_row, n_split];
+  /// With more than one split, each writes its sums over a share of the depth to partial [n_column, n_row, n_split];
   /// `finish_bf16_partial` adds them in order and computes y.
   int n_split;
   float* partial;
   Epilogue end;
-  /// Of strips and of tiles for Hopper alone: y = activation(x gate^T + gate_bias) * (x w^T + bias) and so on, in the
-  /// place of a gate that is there already. Partial sums of the gate stand before the others in a row of 2 n_column.
+  /// Only for strips and Hopper's tiles: computes the gate in the same kernel instead of reading end.gate, y =
+  /// activation(x gate^T + gate_bias) * (x w^T + bias) and so on. Rows of `partial` then have the gate's sums first.
   const std::uint16_t* gate_weight = nullptr;
   const float* gate_bias = nullptr;
 
-  VLA_HOST_DEVICE int n_sum() const { return gate_weight ? 2 * n_column : n_column; }  // of a row
+  VLA_HOST_DEVICE int n_sum() const { return gate_weight ? 2 * n_column : n_column; }  // per row
 };
 
-/// Rows of a block on tensor cores; few: up to kBf16FewRows rows in all, where reading the matrix once is the
-/// bottleneck. A strip has so many columns of up to 64 rows, in which a block has much of the depth on its way at once;
-/// depths are multiples of 8.
+/// The shape of a block. few: kBf16FewRows rows, where reading the matrix once is the bottleneck. stripN: N columns and
+/// up to 64 rows, with loads of much of the depth in flight; the depth must be a multiple of 8. rowsN: N rows and N
+/// columns on tensor cores.
 enum class Bf16Shape { few, strip16, strip32, strip64, strip128, rows64, rows128 };
 constexpr int kBf16FewRows = 8;
 constexpr int kBf16Depth = 32;  // step of the depth, and unit of a split
@@ -55,7 +55,7 @@ inline Launch linear_strip(unsigned width, const LinearBf16Job& job) {
       {"linear_strip_16", "linear_strip_32", "linear_strip_64", "linear_strip_128"},
       {"linear_strip_16_gated", "linear_strip_32_gated", "linear_strip_64_gated", "linear_strip_128_gated"}};
   const int which = width == 16 ? 0 : width == 32 ? 1 : width == 64 ? 2 : 3;
-  const unsigned n_sum = width == 128 ? 2 : width == 64 ? 4 : 8;  // of warps that share columns
+  const unsigned n_sum = width == 128 ? 2 : width == 64 ? 4 : 8;  // warps that have the same columns
   return {kNames[job.gate_weight != nullptr][which],
           {blocks(job.n_sum(), width), blocks(job.n_row, 64), static_cast<unsigned>(job.n_split)},
           256,
@@ -81,15 +81,15 @@ inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
           4 * 2 * size * kBf16Depth * 2};
 }
 
-/// Tiles of kernels for Hopper alone (hopper_linear_bf16.cu): columns, a multiple of 64, and rows, a multiple of 16.
-/// Those that have a kernel for several products in one launch too:
+/// Tiles of the kernels for Hopper only (hopper_linear_bf16.cu): columns, a multiple of 64, and rows, a multiple of 16.
+/// These have a second kernel, for several products in one launch:
 #define VLA_HOPPER_SEVERAL_TILES(each) \
   each(64, 64) each(128, 64) each(128, 96) each(128, 112) each(128, 128) each(128, 192) each(192, 112) each(192, 192)
 #define VLA_HOPPER_OTHER_TILES(each)                                                                      \
   each(64, 128) each(128, 144) each(128, 160) each(128, 176) each(128, 224) each(128, 256) each(192, 160) \
       each(192, 224) each(256, 112) each(256, 128) each(256, 160)
 #define VLA_HOPPER_TILES(each) VLA_HOPPER_SEVERAL_TILES(each) VLA_HOPPER_OTHER_TILES(each)
-/// The same for both matrices of a gated product, of each of which a tile has half of its columns.
+/// The same for gated products. Half of a tile's columns belong to the gate's matrix, half to the other.
 #define VLA_HOPPER_GATED_TILES(each)                                                                      \
   each(128, 96) each(128, 128) each(128, 160) each(128, 192) each(128, 224) each(128, 256) each(256, 112) \
       each(256, 128) each(256, 160)
@@ -111,15 +111,15 @@ constexpr HopperTile kHopperTiles[] = {
             VLA_HOPPER_GATED_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 };
-constexpr int kHopperDepth = 64;  // step of the depth, and unit of a split: each has one at least
-/// Bytes of a step, and steps that shared memory holds: eight, or what the largest of a block on Hopper has room for.
+constexpr int kHopperDepth = 64;  // step of the depth, and unit of a split: each share has at least one
+/// Bytes of a step, and the number of steps in shared memory: eight, or fewer if kHopperShared holds fewer.
 constexpr int hopper_stage_bytes(int columns, int rows) { return (columns + rows) * kHopperDepth * 2; }
 constexpr int hopper_stages(int columns, int rows) {
   const int most = static_cast<int>(kHopperShared) / hopper_stage_bytes(columns, rows);
   return most < 8 ? most : 8;
 }
 inline Launch hopper_linear_bf16(const HopperTile& tile, const LinearBf16Job& job) {
-  // Blocks side by side read the same columns, so that the matrix comes from memory once.
+  // Adjacent blocks read the same columns, so the matrix is read from memory once.
   return {tile.kernel,
           {blocks(job.n_row, tile.rows), blocks(job.n_column, tile.is_gated ? tile.columns / 2 : tile.columns),
            static_cast<unsigned>(job.n_split)},

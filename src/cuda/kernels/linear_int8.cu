@@ -12,8 +12,8 @@ namespace {
 
 constexpr int kDepth = Int8Tile::kDepth;
 
-/// Stores two adjacent sums: the sums themselves if the depth is split, else y. The first block of a split subtracts
-/// the offset.
+/// Stores two adjacent sums: the sums themselves if the depth is split, else y. The first share of the depth subtracts
+/// the offset of ternary codes.
 template <CodeKind kKind>
 VLA_DEVICE void store_pair(const LinearInt8Job& job, const RowScale& of_row, int first, int second, int row,
                            int column) {
@@ -209,8 +209,8 @@ VLA_KERNEL(linear_int8_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::int8
 
 namespace {
 
-/// Four adjacent sums of all shares of the depth, of which n are there. kTogether: all are there and aligned, and
-/// shares are kMostSplits at most, all of which are asked for at once.
+/// Adds four adjacent sums over all shares of the depth; the first n exist. kTogether: all four exist and are aligned,
+/// and there are at most kMostSplits shares, loaded at once.
 template <bool kTogether>
 VLA_DEVICE void add_shares(const LinearInt8Job& job, int row, int column, int n, int (&sum)[4]) {
   const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * job.n_column;

@@ -10,15 +10,15 @@
 /// (kernels/quantized.h).
 namespace vla::cuda {
 
-/// Rows of codes lie as kernels/quantized.h says: the depth in zeros up to a multiple of 64, then 64 bytes that begin
-/// with the row's scale (float) and the sum of its codes (int).
+/// Rows of codes have the layout of kernels/quantized.h: codes padded with zeros to a multiple of 64, then 64 bytes
+/// that begin with the row's scale (float) and the sum of its codes (int).
 ///
-/// A packed matrix is tiles of 32 columns and 64 of the depth, along the depth first. Lane l of a warp owns column
-/// l / 4 of every eight, and of fragment s (0 to 3) the depth 16 s + 4 (l % 4) + b for byte b of a register.
-/// int8: 2048 bytes a tile; 16 bytes for every eight columns and lane, the registers of its four fragments.
-/// ternary: 512 bytes; a word for every eight columns, 16 bytes of each lane. Byte b of it has a code plus 1 in two
-/// bits for each fragment, the first in the lowest, so that a shift by 2 s and a mask make the register. The 1 adds the
-/// row's sum of codes to every product, and comes off at the end.
+/// A packed matrix is a sequence of tiles of 32 columns and 64 of the depth, along the depth first. Lane l of a warp
+/// owns column l / 4 of every eight. Byte b of its register for fragment s (0 to 3) is at depth 16 s + 4 (l % 4) + b.
+/// int8: 2048 bytes per tile. For every eight columns a lane has 16 bytes, the registers of its four fragments.
+/// ternary: 512 bytes. A lane has 16 bytes, a word for every eight columns. Byte b of a word holds code + 1 in two bits
+/// for each fragment, the first fragment lowest, so that a shift by 2 s and a mask give the register. The 1 adds the
+/// row's sum of codes to every product, which is subtracted at the end.
 /// int4: 1056 bytes. For every sixteen columns a lane has 16 bytes, two words for each eight of them. Byte b of the
 /// first word holds the codes of fragments 0 and 1, the lower four bits first; the second word holds those of 2 and 3.
 /// The columns' steps (Int4Block) follow: word i, from 0 to 7, holds the steps of column i of each eight.
@@ -37,8 +37,8 @@ struct LinearInt8Job {
   const std::byte* weight;
   const float* scale;  // [n_column]
   std::int64_t x_stride;
-  int n_row, n_column, depth;  // a multiple of 64
-  /// With more than one split, sums over a share of the depth go to partial [n_column, n_row, n_split];
+  int n_row, n_column, depth;  // depth: a multiple of 64
+  /// With more than one split, each writes its sums over a share of the depth to partial [n_column, n_row, n_split];
   /// `finish_int8_partial` computes y from them. Sums are integers, so the bits stay the same.
   int n_split;
   int* partial;
@@ -50,7 +50,7 @@ std::size_t packed_int8_size(CodeKind kind, std::int64_t d_in, std::int64_t d_ou
 /// stored: d_out rows of d_in elements as in a bundle: int8, ternary in two bits (DType::ternary), or Int4Block.
 void pack_int8(CodeKind kind, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, std::byte* packed);
 
-/// Rows of a block on tensor cores.
+/// The shape of a block. few: four rows. rowsN: N rows and N columns on tensor cores.
 enum class Int8Shape { few, rows64, rows128 };
 /// Steps of the depth in shared memory.
 constexpr int int8_stages(CodeKind kind) { return kind == CodeKind::int8 ? 3 : 4; }
@@ -69,8 +69,8 @@ inline Launch linear_int8(CodeKind kind, Int8Shape shape, const LinearInt8Job& j
           static_cast<unsigned>(int8_stages(kind) * size * (Int8Tile::kDepth + column_bytes(kind)))};
 }
 
-/// Tiles of kernels for Hopper alone (hopper_linear_int8.cu): columns, a multiple of 64, and rows, a multiple of 16.
-/// Those of int8 matrices, whose codes take four times as much shared memory, and more for ternary ones.
+/// Tiles of the kernels for Hopper only (hopper_linear_int8.cu): columns, a multiple of 64, and rows, a multiple of 16.
+/// There are fewer for int8 matrices, because their codes take four times as much shared memory as ternary codes.
 #define VLA_HOPPER_INT8_TILES(each) \
   each(64, 64) each(64, 128) each(128, 64) each(128, 96) each(128, 128) each(128, 176) each(128, 224)
 #define VLA_HOPPER_TERNARY_TILES(each) \
@@ -88,8 +88,8 @@ constexpr HopperInt8Tile kHopperInt8Tiles[] = {
         VLA_HOPPER_TERNARY_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 };
-constexpr int kHopperInt8Depth = 128;  // step of the depth, and unit of a split: each has one at least
-/// Shared memory holds a few stages of rows of x and of packed codes, three of codes in rows, and at last the sums.
+constexpr int kHopperInt8Depth = 128;  // step of the depth, and unit of a split: each share has at least one
+/// Stages in shared memory: of rows of x and packed codes, and of unpacked codes. At the end, sums reuse the memory.
 constexpr int kHopperInt8Stages = 4, kHopperCodeStages = 3;
 constexpr int hopper_int8_stage_bytes(CodeKind kind, int columns, int rows) {
   return rows * kHopperInt8Depth + columns * column_bytes(kind) * (kHopperInt8Depth / Int8Tile::kDepth);

@@ -7,29 +7,29 @@ namespace {
 
 constexpr int kWarps = 8, kThreads = kWarps * kLanes, kStripRows = 64, kTilesM = kStripRows / 16;
 
-/// A block has kColumns columns of sums of up to 64 rows, half of them the gate's where there is one. Its warps have
-/// kTilesN * 8 of the columns each, and take the depth's steps in turn with those that have the same columns.
+/// A block computes sums of up to 64 rows and kColumns columns, half of them the gate's if there is a gate. A warp has
+/// kTilesN * 8 of the columns; warps with the same columns take the steps of the depth in turn.
 template <int kTilesN_, int kWarpsN_, bool kGated_>
 struct Strip {
   static constexpr int kTilesN = kTilesN_, kWarpsN = kWarpsN_, kWarpsK = kWarps / kWarpsN;
   static constexpr bool kGated = kGated_;
   static constexpr int kColumns = kTilesN * 8 * kWarpsN;
   static constexpr int kColumnsY = kGated ? kColumns / 2 : kColumns;
-  // Steps of a warp that are under way: all of a depth of 768 where registers do for them.
+  // Steps that a warp loads ahead: all of a depth of 768 where registers suffice.
   static constexpr int kAhead = kTilesN == 2 || (kGated && kWarpsN == 1) ? 3 : 2;
-  static constexpr int kRowBytes = (kColumns + 8) * 4;  // of sums in shared memory, padded against bank conflicts
+  static constexpr int kRowBytes = (kColumns + 8) * 4;  // a row of sums in shared memory, padded against bank conflicts
 };
 
-/// What a lane loads in a step: 16 bytes, eight elements, of each of its rows and columns. A product's order of the
-/// depth is free, so that it takes them as they lie: the first four in one product of 16, the others in the next.
+/// A lane's operands of a step: 16 bytes, eight elements, of each of its rows and columns. The order of the depth is
+/// free, so elements stay in memory order: the first four enter one product of 16, the other four the next.
 template <class S>
 class Operands {
  public:
-  /// Of a block's rows and columns those of a warp, from column of_warp of the block on.
+  /// Finds the addresses for a warp: all rows of the block, and the columns from column of_warp of the block on.
   VLA_DEVICE Operands(const LinearBf16Job& job, int row0, int column0, int of_warp)
       : x_(static_cast<const std::byte*>(job.x) + row0 * job.x_stride * 2), n_chunk_(job.depth / 8) {
     const int lane = thread_index() % kLanes;
-    // Rows and columns behind the last read that one; their sums are not stored.
+    // Rows and columns after the last one read the last one; their sums are not stored.
     const auto nearest = [](int i, int n) { return i < n ? i : n - 1; };
 #pragma unroll
     for (int r = 0; r < 2 * kTilesM; ++r)
@@ -60,7 +60,7 @@ class Operands {
       }
     }
   };
-  /// Behind the depth weights are zeros, and x is its beginning.
+  /// After the depth, weights are zeros, and x is read from its beginning.
   VLA_DEVICE void load_weight(Step& to, int step) const {
     const int chunk = chunk_of(step);
 #pragma unroll
@@ -85,9 +85,9 @@ class Operands {
 template <class S>
 VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
   constexpr int kPairs = S::kColumnsY / 2, kOf = kStripRows * S::kRowBytes, kEach = kStripRows * kPairs / kThreads;
-  constexpr int kApart = kThreads / kPairs;  // rows between those of a thread
+  constexpr int kApart = kThreads / kPairs;  // distance between two rows of a thread
   const int number = thread_index() / kPairs, of_block = thread_index() % kPairs * 2, column = column0 + of_block;
-  // Where a transaction reads two rows or four, they are in different banks.
+  // If a transaction reads two or four rows, this order puts them in different banks.
   const int first_row = kPairs == 8 ? (number & ~3) + number % 2 * 2 + number / 2 % 2 : number;
   const auto valid = [&](int row) { return row0 + row < job.n_row && column < job.n_column; };
   const auto add = [&](int row, int at) {

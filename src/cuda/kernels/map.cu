@@ -8,8 +8,8 @@ namespace vla::cuda {
 
 namespace {
 
-/// kAtOnce of a thread's elements, 256 apart, so that accesses of a warp are coalesced. All are asked for before any is
-/// used. Index: one that is divided fast, where all elements have such.
+/// Computes kAtOnce of a thread's elements, 256 apart, so that accesses of a warp are coalesced. Loads all of them
+/// before it uses any. Index: a 32-bit type, whose divisions are faster, if it can hold the index of every element.
 template <int kAtOnce, class Index>
 VLA_DEVICE void map(const MapJob& job, Index first, Index n) {
   float a[kAtOnce], b[kAtOnce];

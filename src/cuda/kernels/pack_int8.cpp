@@ -18,7 +18,7 @@ struct Tile {
 
   Tile(CodeKind kind, std::uint8_t zero) : kind_(kind) { std::memset(code, zero, sizeof(code)); }
 
-  /// stored: the row's elements from the tile's first one on, of which n are there.
+  /// stored: the row's elements in the tile, n of them.
   void take(int column, const std::byte* stored, std::int64_t n) {
     std::uint8_t* to = code[column];
     if (kind_ == CodeKind::int8) {
@@ -32,7 +32,7 @@ struct Tile {
       step[column] = block.step;
     }
   }
-  /// The codes of a lane in a fragment.
+  /// The four codes of a lane in a fragment.
   std::uint32_t word(int lane, int eight, int fragment) const {
     std::uint32_t four;
     std::memcpy(&four, &code[8 * eight + lane / 4][16 * fragment + 4 * (lane % 4)], sizeof(four));

@@ -21,7 +21,7 @@ struct RowScale {
   }
 };
 
-/// Whether a number is far enough from the ends of the exponents for `quotient`.
+/// Whether a number's exponent is far enough from its limits for `quotient`.
 VLA_DEVICE bool is_plain(float x) {
   constexpr unsigned kLeast = 127 - 40, kRange = 80;
   return (static_cast<unsigned>(dev::bits_of(x)) >> 23 & 255) - kLeast <= kRange;

@@ -14,19 +14,19 @@ VLA_DEVICE float sum_of_block(float x, std::byte* room) {
 
 /// Codes of a row are those of quantize_row in kernels/quantized.h, to the bit.
 constexpr float kRound = 12582912.0f;  // 1.5 * 2^23: adding it leaves an integer in the lowest bits, ties to even
-/// A value without its sign: such floats order like integers, with NaN above all.
+/// The bits of |x|. As integers they have the order of the floats, with NaN above all.
 VLA_DEVICE int size_of(float x) { return dev::bits_of(x) & 0x7fffffff; }
 VLA_DEVICE float scale_of(int most) {
   const float a = dev::float_of(most);
   return dev::multiply(dev::divide(1.0f, a < 1e-5f ? 1e-5f : a), 127.0f);
 }
-/// The code of x. Bits of NaN are the device's own; the CPU's make code 0.
+/// The code of x: 0 for NaN, as on the CPU, because the bits of a NaN differ between devices.
 VLA_DEVICE unsigned code_of(float x, float s) {
   const float rounded = dev::add(dev::multiply(x, s), kRound);
   return rounded == rounded ? static_cast<unsigned>(dev::bits_of(rounded)) & 0xff : 0;
 }
 VLA_DEVICE int as_signed(unsigned code) { return static_cast<int>(code << 24) >> 24; }
-/// The 64 bytes after the codes.
+/// Stores the 64 bytes after the codes.
 VLA_DEVICE void store_scale(std::byte* end, float s, int sum) {
   if (thread_index() >= 16) return;
   const unsigned scale = s == s ? static_cast<unsigned>(dev::bits_of(s)) : 0x7fc00000;
@@ -58,14 +58,14 @@ VLA_DEVICE void store_codes(std::byte* y, int n, std::byte* room, Value value) {
   store_scale(y + depth, s, across_warps(sum_of_warp(sum), room, sum_of));
 }
 
-/// Four adjacent values of a whole row, or `otherwise` behind its end and where there is no row.
+/// Loads four adjacent values of a row of aligned fours, or `otherwise` after the row's end or if there is no row.
 VLA_DEVICE void load_four(float (&to)[4], const float* row, int i, int n, float otherwise) {
   float4 four = {otherwise, otherwise, otherwise, otherwise};
   if (row && i < n) four = *reinterpret_cast<const float4*>(row + i);
   to[0] = four.x, to[1] = four.y, to[2] = four.z, to[3] = four.w;
 }
 
-/// One reduction of a block; each has room of its own, so that one barrier is enough.
+/// Reduces over a block. Each reduction of a row has its own memory, so one barrier is enough.
 constexpr int kReductionRoom = 64;
 template <class T, class Combine>
 VLA_DEVICE T reduce(T of_warp, int number, Combine combine) {
@@ -75,7 +75,7 @@ VLA_DEVICE float sum_of_block(float x, int number) {
   return reduce(sum_of_warp(x), number, [](float a, float b) { return a + b; });
 }
 
-/// The same for a whole row in registers.
+/// The same as store_codes above, for a row in registers.
 template <int kThreads, int kGroups>
 VLA_DEVICE void store_codes(std::byte* y, int n, const float (&x)[kGroups][4]) {
   const int depth = (n + 63) / 64 * 64;
@@ -101,8 +101,8 @@ VLA_DEVICE void store_codes(std::byte* y, int n, const float (&x)[kGroups][4]) {
   store_scale(y + depth, s, reduce(sum_of_warp(sum), 3, sum_of));
 }
 
-/// The input of a row's norm, four values at a time: every load is issued before the first value is computed. Here x +
-/// residual.
+/// The input x + residual of a row's norm, four values at a time. Every load is issued before the first value is
+/// computed.
 template <int kGroups>
 class Added {
  public:
@@ -115,7 +115,7 @@ class Added {
  private:
   float x_[kGroups][4], residual_[kGroups][4];
 };
-/// Here a product, from the shares of its depth.
+/// The input of a norm that follows a product: adds the product's sums over the shares of the depth.
 template <int kGroups>
 class Finished {
  public:
@@ -151,15 +151,15 @@ VLA_DEVICE void store_four(const NormJob& job, std::int64_t row, int i, const fl
     *reinterpret_cast<float4*>(static_cast<float*>(job.y) + to) = float4{x[0], x[1], x[2], x[3]};
 }
 
-/// Norms a row of up to 4 kGroups values of each of kThreads threads, in registers, `thread` being this one's number.
-/// All that is read is asked for at once. of: Added or Finished, of operands `from`. sum_of_row(x, number): over those
-/// threads, the first and the second of a row. store(x): what is done with the normalized row.
+/// Normalizes a row in registers, up to 4 kGroups values in each of kThreads threads; `thread` is this thread's index.
+/// Issues all loads at once. of: Added or Finished, which reads the operands `from`. sum_of_row(x, number): sums x over
+/// the threads; number is 0 or 1, the first or second sum of the row. store(x): receives the normalized row.
 template <int kGroups, int kThreads, class Of, class From, class Sum, class Store>
 VLA_DEVICE void norm_in_registers(const NormJob& job, std::int64_t row, int thread, Of of, const From& from,
                                   Sum sum_of_row, Store store) {
   const int n = job.n;
   const auto place = [&](int j) { return 4 * (thread + kThreads * j); };
-  // Weights have registers where a row takes few; else they are read when they are used.
+  // Weights are loaded early if the row leaves registers for them, else when they are used.
   constexpr bool kEarly = kGroups <= 2;
   float x[kGroups][4], weight[kGroups][4], bias[kGroups][4];
   const auto load_weights = [&](int j) {
@@ -202,7 +202,7 @@ VLA_DEVICE void norm_in_registers(const NormJob& job, std::int64_t row, int thre
   store(x);
 }
 
-/// The row of a block.
+/// Normalizes one row per block.
 template <int kGroups, int kThreads = 256, class Of, class From>
 VLA_DEVICE void norm_of_block(const NormJob& job, Of of, const From& from) {
   const std::int64_t row = blockIdx.x;
@@ -224,7 +224,7 @@ VLA_KERNEL(norm_rows_8, 512, 2, NormJob) { norm_of_block<4, 512>(job, Added<4>{}
 VLA_KERNEL(finish_norm_rows_1, 256, 2, FinishNormJob) { norm_of_block<1>(job.norm, Finished<1>{}, job.product); }
 VLA_KERNEL(finish_norm_rows_2, 256, 2, FinishNormJob) { norm_of_block<2>(job.norm, Finished<2>{}, job.product); }
 
-/// The row of a warp.
+/// Normalizes one row per warp.
 VLA_KERNEL(norm_many_rows, 128, 4, NormJob) {
   constexpr int kGroups = kOfWarp / 4 / kLanes;
   const int lane = thread_index() % kLanes;
@@ -276,8 +276,8 @@ VLA_KERNEL(norm_rows, 256, 4, NormJob) {
     store(job.y, job.type == RowType::bf16, row * job.y_stride + i, normed(i));
 }
 
-/// A warp computes a row of a head; a lane the pairs (i, i + d_head / 2) of every 32nd i, kAtOnce of which it asks for
-/// at once.
+/// A warp computes one row of a head. A lane computes the pairs (i, i + d_head / 2) of every 32nd i and loads kAtOnce
+/// pairs at a time.
 VLA_DEVICE void turn_heads(const HeadJob& job, int block) {
   constexpr int kAtOnce = 4;
   const int lane = thread_index() % kLanes, half = job.d_head / 2;

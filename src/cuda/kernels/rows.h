@@ -17,7 +17,7 @@ struct NormJob {
   const float* residual;       // n_row contiguous rows of n values, or null
   float* sum;                  // receives x + residual, in the residual's layout, or null
   const float *weight, *bias;  // [n], or null
-  void* y;                     // stride of rows in elements, for codes in bytes
+  void* y;                     // rows with stride y_stride, in elements, or in bytes for codes
   std::int64_t x_stride, y_stride;
   int n_row, n;
   float eps;
@@ -45,9 +45,9 @@ inline Launch norm_rows(const NormJob& job) {
   return {job.n <= 2048 ? "norm_rows_2" : "norm_rows_4", {n_row}, 256, 256};
 }
 
-/// y = norm(v) for the v of a product whose depth is split into up to kMostSplits, of up to kMostFinished columns: adds
-/// the shares as finish_bf16_partial does, without an activation, a gate and a last ReLU. v goes to norm.sum. Rows
-/// consist of aligned fours.
+/// y = norm(v), where v is a product of up to kMostFinished columns whose depth is split into up to kMostSplits shares.
+/// Adds the shares as finish_bf16_partial does, for an epilogue without activation, gate and final ReLU. norm.sum
+/// receives v. Rows consist of aligned fours.
 struct FinishNormJob {
   LinearBf16Job product;
   NormJob norm;  // without x and residual
@@ -87,7 +87,7 @@ inline Launch several_head_rows(Several<HeadJob>& jobs) {
 }
 
 enum class TableType { f32, f16, bf16 };
-/// Looks up rows of a table. An id out of range gives a row of NaN; ids are checked before.
+/// Looks up rows of a table. An id out of range gives a row of NaN; callers check ids before the launch.
 struct LookupJob {
   const void* table;  // n_table rows of n
   const std::int32_t* ids;

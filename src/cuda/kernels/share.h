@@ -7,7 +7,7 @@
 
 namespace vla::cuda {
 
-/// Stores two adjacent sums of a share of the depth, from column `at` of a row of them on.
+/// Stores two adjacent sums over a share of the depth to columns `at` and at + 1 of a row of `partial`.
 VLA_DEVICE void store_partial(const LinearBf16Job& job, float first, float second, int row, int at, bool has_second) {
   float* to = job.partial + (static_cast<std::int64_t>(blockIdx.z) * job.n_row + row) * job.n_sum() + at;
   if (has_second && job.n_sum() % 2 == 0 && at % 2 == 0) {
@@ -24,7 +24,7 @@ VLA_DEVICE void store_pair(const LinearBf16Job& job, float first, float second, 
   store_partial(job, first, second, row, column, column + 1 < job.n_column);
 }
 
-/// Adds the gate's bias to two sums of it.
+/// Adds the gate's bias to two sums of the gate.
 VLA_DEVICE void add_gate_bias(const LinearBf16Job& job, PairEnds& ends, int column) {
   if (job.gate_bias == nullptr) return;
   ends.gate.x = dev::add(ends.gate.x, job.gate_bias[column]);

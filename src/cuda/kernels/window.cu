@@ -9,7 +9,7 @@
 namespace vla::cuda {
 namespace {
 
-/// A place of the window: the pixel at its upper left corner, which may be outside of the image.
+/// A position of the window: its upper left pixel, which may be outside of the image.
 struct Place {
   const float* image;
   int column, row;
@@ -28,7 +28,7 @@ VLA_DEVICE float feature(const WindowJob& job, const float* image, int column, i
   return image[(static_cast<std::int64_t>(row) * job.width + column) * job.d + i];
 }
 
-/// NaN where one is NaN.
+/// The maximum of feature i in the window; NaN if any value is NaN.
 VLA_DEVICE float largest(const WindowJob& job, const Place& place, int i) {
   float most = -INFINITY;
   for (int pixel = 0; pixel < job.size * job.size; ++pixel) {

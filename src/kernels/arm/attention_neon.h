@@ -7,12 +7,12 @@
 
 namespace vla::kernels {
 
-/// Float32 products of 6 rows by four vectors. One load brings four elements of a row, which multiply-adds take by
-/// lane.
+/// Float32 products of 6 rows by four vectors. One load reads four elements of a row; a multiply-add selects one of
+/// them by lane.
 struct NeonProducts : FloatProducts<Neon, 6, 4> {
   static constexpr int kMinPanel = kPanel, kDepth = 4;
 
-  /// Transposes kPanel rows into steps of the depth, starting at `k`.
+  /// Copies kPanel rows as steps of the depth, starting at `k`.
   static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t, Number* panel) {
     for (int i = 0; i < kPanel; ++i)
       std::memcpy(panel + (k + i) * kPanel, rows + i * kHeadStride, kPanel * sizeof(*rows));

@@ -6,8 +6,8 @@
 namespace vla::kernels {
 namespace {
 
-/// SDOT: four products of codes and elements for each of four columns. A tile is 6 rows by 4 vectors; one load brings
-/// sixteen codes of a row, of which an instruction takes four by lane.
+/// SDOT: four products of codes and elements for each of four columns. A tile is 6 rows by 4 vectors. One load reads
+/// sixteen codes of a row; an instruction selects four of them by lane.
 struct DotTile {
   using V = Neon;
   static constexpr int kRows = 6, kColumns = 16, kBlockRows = 216, kStep = 512, kVectors = kColumns / V::width;
@@ -56,7 +56,7 @@ struct DotTile {
     for (int n = 0; n < kVectors; ++n) multiply_add<s>(strips.template load<int8x16_t>(k, s, 0, 16 * n), rows, sums[n]);
   }
 
-  /// sums += weights * four codes of each row. Written as assembly for the reason given in linear_neon.cpp.
+  /// sums += weights * four codes of each row. Written as assembly for the reason given in neon_multiply_add.h.
   template <int s, int kCount>
   static VLA_INLINE void multiply_add(int8x16_t numbers, const int8x16_t (&rows)[kCount], int32x4_t (&sums)[kCount]) {
     if constexpr (kCount == 6)

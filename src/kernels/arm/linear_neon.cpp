@@ -7,8 +7,8 @@
 namespace vla::kernels {
 namespace {
 
-/// 6 rows by 4 vectors: 24 of the 32 registers hold sums. One load brings four elements of a row of x, which
-/// multiply-adds take by lane.
+/// 6 rows by 4 vectors: 24 of the 32 registers hold sums. One load reads four elements of a row of x; a multiply-add
+/// selects one of them by lane.
 struct NeonTile {
   using V = Neon;
   using X = float;

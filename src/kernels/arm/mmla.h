@@ -44,7 +44,7 @@ constexpr int kMmlaRows = 6, kMmlaColumns = 16;
         "v17", "v18", "v19", "v20", "v21", "v22", "v23", "v24", "v25", "v26", "v27", "v28", "v29", "v30", "v31")
 // clang-format on
 
-/// What to prefetch: an address, and bytes per step.
+/// Where to prefetch: an address, and the bytes to advance per step.
 struct MmlaAhead {
   const std::byte* from;
   std::int64_t skip;

@@ -11,7 +11,7 @@ namespace vla::kernels {
 struct Neon : Lanes<4> {
   static VLA_INLINE Float set(float x) { return vdupq_n_f32(x); }
   static VLA_INLINE Float fma(Float a, Float b, Float c) { return vfmaq_f32(c, a, b); }
-  // Returns the second operand if the first is NaN, where FMIN and FMAX return NaN.
+  // Returns the second operand if the first is NaN; FMIN and FMAX would return NaN.
   static VLA_INLINE Float min(Float a, Float b) { return a < b ? a : b; }
   static VLA_INLINE Float max(Float a, Float b) { return a > b ? a : b; }
   static VLA_INLINE float sum(Float x) { return vaddvq_f32(x); }

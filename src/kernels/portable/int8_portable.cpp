@@ -6,7 +6,7 @@
 namespace vla::kernels {
 namespace {
 
-/// Written for any compiler to vectorize.
+/// Plain loops, which any compiler can vectorize.
 struct PortableTile {
   using V = Portable;
   static constexpr int kRows = 5, kColumns = 32, kBlockRows = 25, kStep = 128;

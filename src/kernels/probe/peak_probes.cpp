@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 // Loops of multiply-adds on registers. Each loop has as many sums as registers allow, so that no multiply-add waits for
-// the one before; each sum starts at another value, so that no compiler finds two of them equal.
+// the previous one. Each sum starts at a different value, so that the compiler cannot merge equal sums.
 #include <algorithm>
 
 #include "kernels/machine_kernels.h"

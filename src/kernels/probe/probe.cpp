@@ -33,7 +33,7 @@ double shortest_burst(int n_thread, double seconds, const std::function<void(int
   std::atomic<bool> again = true;
   double shortest = 0;
   const Clock::time_point start = Clock::now();
-  const auto judge = [&] {  // written by thread 0 while the others wait
+  const auto judge = [&] {  // runs on thread 0 while the other threads wait
     auto begin = spans[0].begin, end = spans[0].end;
     for (const Span& span : spans) begin = std::min(begin, span.begin), end = std::max(end, span.end);
     const double time = seconds_between(begin, end);
@@ -59,7 +59,8 @@ double shortest_burst(int n_thread, double seconds, const std::function<void(int
   return shortest;
 }
 
-/// Rounds of about a millisecond: long beside the clock's resolution, short beside interruptions.
+/// The number of rounds that take about a millisecond: much longer than the clock's resolution, short enough that most
+/// bursts are not interrupted.
 long rounds_of_a_burst(const PeakProbe& probe) {
   constexpr double kBurst = 1e-3;
   for (long n = 1024;; n *= 2) {
@@ -92,7 +93,7 @@ class Memory {
 };
 
 std::size_t beyond_caches() {
-  const long last_cache = ::sysconf(_SC_LEVEL3_CACHE_SIZE);  // 0 or less if the system does not tell
+  const long last_cache = ::sysconf(_SC_LEVEL3_CACHE_SIZE);  // 0 or less if unknown
   return std::clamp<std::size_t>(4 * static_cast<std::size_t>(std::max(0L, last_cache)), std::size_t{256} << 20,
                                  std::size_t{1} << 30);
 }

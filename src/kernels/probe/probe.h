@@ -23,14 +23,14 @@ struct PeakProbe {
 /// All loops that this machine can run, slowest instructions first.
 const std::vector<PeakProbe>& peak_probes();
 
-/// The loop that these kernels' speed is measured against: that of their own products, or the fastest in float32 for
-/// ggml, which uses no features of ours.
+/// The loop that the speed of kernels with these features is compared with: the one with the instructions of their
+/// products, or, for ggml, which has no features, the fastest one in float32.
 const PeakProbe& peak_probe_of(Features use);
-/// The same for their products of int8 codes with ternary or int8 weights; null if they have no such instructions.
+/// The same for products of int8 codes with ternary or int8 weights; null if no feature has such instructions.
 const PeakProbe* int8_probe_of(Features use, bool ternary);
 
 /// Operations per second (wall time) of `n_thread` threads that run the loop at once: the best of many short bursts
-/// within about `seconds`. This is what the machine can do, not what other programs leave of it.
+/// within about `seconds`. The best burst is the machine's own rate, even if other programs slow down other bursts.
 double measure_peak(const PeakProbe& probe, int n_thread, double seconds);
 
 /// Bytes per second (wall time) that `n_thread` threads read from memory several times larger than L3: the best pass

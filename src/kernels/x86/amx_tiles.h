@@ -31,7 +31,7 @@ struct AmxRounding {
 };
 
 /// Call it before tiles are loaded. GCC's intrinsic does not say that it reads memory, so the compiler could move
-/// earlier stores behind it.
+/// earlier stores past it.
 VLA_INLINE void before_tile_loads() { asm volatile("" ::: "memory"); }
 
 /// After about 2,300 cycles without 512-bit arithmetic the processor powers that unit down, and the next tile store

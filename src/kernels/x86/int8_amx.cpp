@@ -8,8 +8,8 @@ namespace vla::kernels {
 namespace {
 
 /// 32 rows by 32 columns: four tiles of sums, two of x and two of the panel. For few rows, where reading weights is the
-/// bottleneck, VNNI multiplies: a tile takes the time of sixteen rows, and codes smaller than a byte go through memory
-/// on their way to it.
+/// bottleneck, VNNI multiplies instead: a tile takes the time of sixteen rows even for fewer, and codes smaller than a
+/// byte must be expanded in memory before a tile can load them.
 struct AmxInt8Tile : AmxRounding {
   using Session = AmxSession;
   static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kStep = 768;
@@ -28,7 +28,7 @@ struct AmxInt8Tile : AmxRounding {
 
  private:
   using Few = VnniRows<2>;
-  static constexpr int kDepth = 64;  // of a tile
+  static constexpr int kDepth = 64;  // depth of a tile
   static constexpr std::size_t kLine = kColumns * sizeof(std::int32_t), kLineOfPair = 2 * Int8Panels::kLine;
 
   template <class Packed, class Between>
@@ -90,8 +90,8 @@ struct AmxInt8Tile : AmxRounding {
     _tile_loadd(3, sums + 16 * kColumns + 16, kLine);
   }
 
-  /// x bypasses L1, where the panel stays. The first operand is signed, the second unsigned: lines of two strips with
-  /// their strides.
+  /// x bypasses L1, where the panel stays. The first operand, x, is signed; the second is unsigned: lines, `line` bytes
+  /// apart, of two strips, `strip` bytes apart.
   static VLA_INLINE void add_products(int n_row, const std::byte* x, std::int64_t x_stride, const std::byte* lines,
                                       std::size_t line, std::int64_t strip) {
     _tile_stream_loadd(4, x, static_cast<std::size_t>(x_stride));
@@ -112,7 +112,7 @@ struct AmxInt8Tile : AmxRounding {
       _tile_stored(2, sums + 16 * kColumns, kLine);
       _tile_stored(3, sums + 16 * kColumns + 16, kLine);
     }
-    before_tile_loads();  // and loads of the sums do not move before the stores
+    before_tile_loads();  // also keeps loads of the sums after the stores
   }
 };
 

@@ -25,15 +25,15 @@ struct TwoProducts {
   static_assert(kStep / 4 * 2 * 2 * 127 <= 32767);
 
   static VLA_INLINE void add(__m256i& sum, __m256i numbers, __m256i codes) {
-    __m256i pairs;  // from intrinsics, compilers add pairs to each other first and run out of registers
+    __m256i pairs;  // with intrinsics, compilers add pairs to each other first and run out of registers
     asm("vpmaddubsw %3, %2, %1\n\tvpaddw %1, %0, %0" : "+x"(sum), "=&x"(pairs) : "x"(numbers), "x"(codes));
   }
   static VLA_INLINE __m256i total(__m256i sum) { return _mm256_madd_epi16(sum, _mm256_set1_epi16(1)); }
 };
 
-/// Products of int8 weights: a pair of products of bytes up to 255 with codes does not fit into 16 bits. So the code
-/// takes the weight's sign (a code is never -128), and the weight becomes its magnitude, at most 128; pairs are widened
-/// to 32 bits at once.
+/// Products of int8 weights: the sum of two products of bytes up to 255 with codes does not fit into 16 bits. So the
+/// code takes the weight's sign (a code is never -128), and the weight becomes its magnitude, at most 128. Pairs are
+/// widened to 32 bits immediately.
 struct SignedProducts {
   static constexpr int kRows = 4, kStep = 512;
   static constexpr bool kSigned = true;
@@ -47,7 +47,7 @@ struct SignedProducts {
   static VLA_INLINE __m256i total(__m256i sum) { return sum; }
 };
 
-/// Rows by 2 vectors of sums.
+/// A tile of rows by 2 vectors of sums.
 template <class Products>
 struct Avx2Tile {
   using V = Avx2;
@@ -94,12 +94,12 @@ struct Avx2Tile {
   }
 };
 
-/// The same for many rows, without the product of signs: code ^ sign is -code - 1 where a weight is negative, so a sum
-/// lacks the magnitudes of all negative weights of its column. Magnitudes, signs and what sums lack are made once per
-/// step of the depth.
+/// The same for many rows, without the product of signs: code ^ sign is -code - 1 if the weight is negative, so a sum
+/// is too small by the magnitudes of its column's negative weights. Magnitudes, signs and these corrections are
+/// computed once per step of the depth.
 struct SignedTile : Avx2Tile<SignedProducts> {
-  /// For each four elements of 16 columns a line of magnitudes and one of signs, all bits of which are ones where a
-  /// weight is negative; behind all lines what the columns' sums lack.
+  /// For every four elements of 16 columns, a line of magnitudes and a line of signs; the sign of a negative weight has
+  /// all bits set. After all lines come the corrections of the columns' sums.
   struct Panel {
     static constexpr std::int64_t kSize = 2 * kStep * kColumns + kColumns * 4;
     const std::byte* lines;
@@ -152,7 +152,7 @@ struct SignedTile : Avx2Tile<SignedProducts> {
           const __m256i codes = _mm256_set1_epi32(four);
 #pragma GCC unroll 2
           for (int i = 0; i < 2; ++i) {
-            __m256i pairs;  // from intrinsics, compilers run out of registers
+            __m256i pairs;  // with intrinsics, compilers run out of registers
             asm("vpxor %4, %2, %1\n\tvpmaddubsw %1, %3, %1\n\tvpmaddwd %5, %1, %1\n\tvpaddd %1, %0, %0"
                 : "+x"(sum[r][i]), "=&x"(pairs)
                 : "x"(codes), "x"(size[i]), "x"(sign[i]), "x"(ones));
@@ -169,8 +169,9 @@ struct SignedTile : Avx2Tile<SignedProducts> {
   }
 };
 
-/// Products of int4 weights: pairs of code products are summed to 16 bits, which hold a block's sum minus eight times
-/// the sum of x in it: 32 * 7 * 127. The block's step multiplies that.
+/// Products of int4 weights: pairs of code products are summed to 16 bits, from which eight times the block's sum of x
+/// is subtracted, because code 8 stands for zero. The difference, at most 32 * 7 * 127, fits into 16 bits and is
+/// multiplied by the block's step.
 struct Int4Tile {
   using V = Avx2;
   static constexpr int kRows = 6, kColumns = 16, kBlockRows = 216, kStep = 1024, kBlock = Int4Block::kElements;

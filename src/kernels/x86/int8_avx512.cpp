@@ -6,7 +6,7 @@
 namespace vla::kernels {
 namespace {
 
-/// 24 sums.
+/// 6 rows by 4 vectors: 24 sums.
 template <int kDepth>
 struct VnniTile {
   using V = Avx512;

@@ -1,12 +1,13 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Products of ternary matrices where permutations look sums up beside VNNI.
+// Products of ternary matrices: permutations look up some of the sums while VNNI multiplies the rest.
 //
-// Three ternary elements by three codes of x have one of 27 sums. A *table* has them all, in 16 bits, in one register.
-// With three elements of each of 32 columns as indices vpermw finds 32 sums in it, which vpaddw adds: 96 multiply-adds
-// by two instructions, where VNNI makes 64 by one. Cores of AMD permute and add beside multiplying, so that both ways
-// run side by side: of seven elements of a column, four are multiplied and three looked up. The sums are the same.
+// The products of three ternary elements with three given codes of x have one of 27 sums. A *table* holds all 27, 16
+// bits each, in one register. vpermw takes three elements of each of 32 columns as indices and finds 32 sums in the
+// table, and vpaddw adds them: 96 multiply-adds in two instructions; VNNI does 64 in one. AMD's cores permute and add
+// while they multiply, so both methods run at the same time: of seven elements of a column, four are multiplied and
+// three looked up. Both methods give the same sums.
 #include "kernels/int8_loop.h"
 #include "kernels/x86/vec_avx512.h"
 
@@ -20,12 +21,13 @@ using V = Avx512;
 constexpr std::int64_t kRows = 4, kColumns = 64, kStrips = kColumns / Int8Panels::kColumns;
 constexpr std::int64_t kRegister = 64;  // bytes
 
-/// A part of the depth, starting at k: n_lookup times three elements that are looked up, then n_group times four that
-/// are multiplied. A tile alternates one lookup and one multiplication, then multiplies the remaining groups.
+/// A part of the depth, starting at k: n_lookup times three elements that are looked up, then n_group times four
+/// elements that are multiplied. A tile alternates one lookup and one multiplication, then multiplies the remaining
+/// groups.
 struct Step {
   std::int64_t k, n_lookup, n_group;
 
-  /// In lines of 16 elements; three lines make 16 tables.
+  /// kTableLines and kLines count lines of 16 elements; three lines make 16 tables.
   static constexpr std::int64_t kTableLines = 3, kLines = 14, kMaxLookup = 32, kMaxGroup = 4 * (2 * kLines - 1);
   static_assert(kMaxLookup * 2 * 3 * 127 <= 32767, "sums of 16 bits");
 
@@ -43,7 +45,7 @@ struct Step {
   std::int64_t multiplied() const { return k + 3 * n_lookup; }
 };
 
-/// Element 0 to 2 of each of the three that an index stands for: index = first + 3 second + 9 third. Byte 4 j + i is
+/// The three elements, 0 to 2 each, that an index stands for: index = first + 3 second + 9 third. Byte 4 j + i is
 /// element i of index 8 (j / 4) + j % 4 (+ 4 in the second half), the order in which vpackssdw interleaves.
 struct TableNumbers {
   alignas(kRegister) std::uint8_t half[2][64] = {};
@@ -61,7 +63,7 @@ constexpr TableNumbers kTableNumbers;
 
 typedef std::uint32_t Words __attribute__((vector_size(kRegister)));
 
-/// The 16 tables of a row for codes k, 16 + k and 32 + k, with a stride of kRows registers.
+/// Makes 16 tables of a row, with a stride of kRows registers; table k is for codes k, 16 + k and 32 + k.
 VLA_INLINE void make_tables(const std::byte* x, std::byte* to) {
   const auto widened = [&](int from) VLA_LAMBDA {
     struct Codes {
@@ -85,8 +87,8 @@ VLA_INLINE void make_tables(const std::byte* x, std::byte* to) {
   }
 }
 
-/// Indices of a panel's columns into these tables: elements k of three lines of each strip. A register interleaves
-/// those of two strips, in the lowest five bits of 16; vpermw ignores the rest.
+/// Makes the indices of a panel's columns into these tables: from elements k of three lines of each strip. A register
+/// interleaves the indices of two strips, each in the lowest five bits of 16; vpermw ignores the other bits.
 VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::byte* to) {
   for (int pair = 0; pair < kStrips / 2; ++pair)
     for (int s = 0; s < 4; ++s) {
@@ -107,8 +109,8 @@ VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::b
     }
 }
 
-// Registers of a tile: 0 to 15 are sums of four rows by four strips, 16 to 23 those of 16 bits of four rows by two
-// strips in turn, 25 to 28 the elements of a group, 29 and 30 its indices.
+// Registers of a tile: 0 to 15 hold sums of four rows by four strips, 16 to 23 sums of 16 bits of four rows by two
+// pairs of interleaved strips, 25 to 28 the elements of a group, 29 and 30 the indices of a lookup.
 // clang-format off
 #define VLA_FOR_SUMS(what)                                                                  \
   what("0", "0") what("1", "64") what("2", "128") what("3", "192")                          \
@@ -141,7 +143,7 @@ VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::b
   "vpermw %%zmm31, %%zmm30, %%zmm31\n"                                                      \
   "vpaddw %%zmm31, %%zmm" odd ", %%zmm" odd "\n"                                            \
   VLA_MULTIPLY(table, x, a, b, c, d, even, odd)
-/// Adds 16-bit sums at even places to those of the first strip, at odd places to those of the second.
+/// Adds the 16-bit sums at even places to the sums of the first strip, at odd places to those of the second.
 #define VLA_ADD_LOOKED_UP(table, x, a, b, c, d, even, odd)                                  \
   "vpdpwssd %%zmm24, %%zmm" even ", %%zmm" a "\n"                                           \
   "vpdpwssd %%zmm25, %%zmm" even ", %%zmm" b "\n"                                           \
@@ -149,8 +151,8 @@ VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::b
   "vpdpwssd %%zmm25, %%zmm" odd ", %%zmm" d "\n"
 // clang-format on
 
-/// sums [kColumns] x kRows += the products of a step. The whole tile is assembly, because compilers copy every sum of
-/// intrinsics and the tile needs all registers.
+/// sums [kColumns] x kRows += the products of a step. The whole tile is assembly, because with intrinsics compilers
+/// copy every sum, and the tile needs all registers.
 void tile(const std::byte* x, std::int64_t stride, const std::byte* numbers, const std::byte* indices,
           const std::byte* tables, const Step& step, std::int32_t* sums) {
   std::int64_t n_lookup = step.n_lookup, n_more = step.n_group - step.n_lookup;
@@ -204,7 +206,7 @@ void tile(const std::byte* x, std::int64_t stride, const std::byte* numbers, con
 class LookupLoop {
   static constexpr std::int64_t kBlockRows = 108;
   static constexpr std::int64_t kPanels = 20;                   // panels whose steps and sums fit into L2
-  static constexpr std::int64_t kManyPanels = 8;                // they share the cost of making tables
+  static constexpr std::int64_t kManyPanels = 8;                // panels that share the cost of making tables
   static constexpr std::int64_t kMinItems = 2, kManyItems = 8;  // per thread, if there are that many
 
   struct Tile {
@@ -281,7 +283,7 @@ class LookupLoop {
     }
   }
 
-  /// A step of a part's columns.
+  /// Expands a step of a part's columns.
   void expand(const LinearJob::Part& part, std::int64_t column, const Step& step, Numbers& numbers) {
     const std::int64_t strip = TernaryPanels::strip_size(job_.d_in);
     const std::byte* strips = part.weight + column / Int8Panels::kColumns * strip;

@@ -6,7 +6,7 @@
 namespace vla::kernels {
 namespace {
 
-/// A square of float32 sums is four tiles; a square of x is two, and one of a panel two.
+/// A square of float32 sums takes four tiles; a square of x and a square of a panel take two each.
 struct AmxTile : AmxRounding {
   using Session = AmxSession;
 
@@ -24,7 +24,7 @@ struct AmxTile : AmxRounding {
   static constexpr std::size_t kLineX = kTileSide * sizeof(std::uint16_t), kLineC = kTileSide * sizeof(float);
   static constexpr std::int64_t kHalf = kTileSide / 2 * kTileSide;  // offset of a square's upper half in elements
 
-  /// All 32 rows or the first 16. x bypasses L1, where the panel stays for the next rows.
+  /// Multiplies all 32 rows or the first 16. x bypasses L1, where the panel stays for the next rows.
   template <bool kAll, class Between>
   static VLA_INLINE void product(const std::uint16_t* x, const std::byte* panel, std::int64_t n_square, float* c,
                                  bool add, Between& between) {
@@ -66,7 +66,7 @@ struct AmxTile : AmxRounding {
   }
 };
 
-/// For few rows, where reading weights is the bottleneck; x stays float32.
+/// Up to this many rows, reading weights is the bottleneck: kLinearAvx512 multiplies, with x in float32.
 constexpr std::int64_t kMaxFew = 16;
 
 bool supports(const MatrixDesc& desc, Features use) { return use.has(Feature::amx_bf16) && desc.type == DType::bf16; }

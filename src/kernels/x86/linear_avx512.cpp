@@ -34,13 +34,13 @@ struct Avx512Tile {
     static VLA_INLINE void add(__m512& sum, __m512 value, __m512 numbers) {
 #ifdef VLA_EMULATED_INSTRUCTIONS  // in plain C++ for tests
       sum = _mm512_fmadd_ps(value, numbers, sum);
-#else  // from the intrinsic, GCC 12 moves sums between registers
+#else  // with the intrinsic, GCC 12 moves sums between registers
       asm("vfmadd231ps %2, %1, %0" : "+v"(sum) : "v"(value), "v"(numbers));
 #endif
     }
   };
-  // Element k of 16 columns as floats. It uses all-ones masks, because GCC 12 warns about undefined lanes in its own
-  // header for the unmasked form.
+  // `load` returns element k of 16 columns as floats. It uses all-ones masks, because for the unmasked form GCC 12
+  // warns about undefined lanes in its own header.
   struct Pairs : Number {
     static constexpr int kBlock = 32, kSize = 2;
     static VLA_INLINE __m512 load(const std::byte* p, int k) {

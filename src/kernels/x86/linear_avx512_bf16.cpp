@@ -51,7 +51,7 @@ struct Avx512Bf16Tile {
   };
 };
 
-/// For few rows, where reading weights is the bottleneck; x stays float32.
+/// Up to this many rows, reading weights is the bottleneck: kLinearAvx512 multiplies, with x in float32.
 constexpr std::int64_t kMaxFew = 16;
 
 bool supports(const MatrixDesc& desc, Features use) {

@@ -18,7 +18,7 @@ template <class Step, int kCount>
 void multiply_tile(const typename Step::X* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
                    const Prefetch& ahead) {
   constexpr int kSteps = 4, kDepth = kSteps * Step::kCount;
-  const std::int64_t n_line = ceil_div(ahead.size * kDepth, 64 * depth);  // cache lines for each kDepth of the depth
+  const std::int64_t n_line = ceil_div(ahead.size * kDepth, 64 * depth);  // cache lines to prefetch for each kDepth
   const std::byte* next = ahead.from;
   __m512 sum[kCount][2];
 #pragma GCC unroll 12  // without it GCC keeps some of the sums in memory

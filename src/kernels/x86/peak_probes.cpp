@@ -36,8 +36,8 @@ constexpr float kFactor = 0.999f, kTerm = 0.001f;
   for (const __m512& s : sums) sink = _mm512_cvtss_f32(s);
 }
 
-/// The whole loop in assembly, with `body` once for each of `sums`: from intrinsics, compilers copy every sum, which
-/// halves the rate.
+/// Writes the whole loop in assembly, with `body` once for each of `sums`: with intrinsics, compilers copy every sum,
+/// which halves the rate.
 // clang-format off
 #define VLA_SUM_LOOP(sums, body, ...)                                                       \
   if (n_round <= 0) return;                                                                 \
@@ -60,8 +60,8 @@ constexpr float kFactor = 0.999f, kTerm = 0.001f;
   VLA_SUM_LOOP(VLA_28_SUMS, "vdpbf16ps %%zmm30, %%zmm31, %%zmm\\sum\n", VLA_32_REGISTERS);
 }
 
-/// 32 sums of three elements looked up by a permutation, beside VNNI (int8_lookup_avx512.cpp): 96 multiply-adds for
-/// each permutation with its addition, and two products of 64 meanwhile.
+/// Permutations that look up 32 sums of three products, beside VNNI (int8_lookup_avx512.cpp): 96 multiply-adds for each
+/// permutation with its addition, and at the same time two VNNI products of 64 multiply-adds.
 [[gnu::target("avx512f")]] void multiply_add_lookup(long n_round) {
   VLA_SUM_LOOP("0,1,2,3,4,5,6,7",
                "vpermw %%zmm30, %%zmm31, %%zmm29\n"
@@ -96,7 +96,7 @@ struct alignas(64) TileConfig {
   std::uint8_t n_row[16] = {16, 16, 16, 16, 16, 16, 16, 16};
 };
 
-// constant memory, because the intrinsic does not tell the compiler that it reads all of it
+// constant memory, because the intrinsic does not tell the compiler that it reads the whole configuration
 constexpr TileConfig kTiles;
 
 /// Tiles 0 to 5 sum products of tiles 6 and 7, which are zero. With different elements the loop runs at 86 % of this

@@ -10,8 +10,8 @@ namespace vla::kernels {
 struct Avx512 : Lanes<16> {
   static VLA_INLINE Float set(float x) { return _mm512_set1_ps(x); }
   static VLA_INLINE Float fma(Float a, Float b, Float c) { return _mm512_fmadd_ps(a, b, c); }
-  /// 1 / b for normal floats with a relative error of 2^-23.9: the instruction's 2^-14 and one Newton step, in a third
-  /// of the time of a division.
+  /// a / b for normal floats, with a relative error of 2^-23.9: an estimate of 1 / b to 2^-14 and one Newton step, in a
+  /// third of the time of a division.
   static VLA_INLINE Float divide(Float a, Float b) {
     const Float inverse = reciprocal(b), quotient = a * inverse;
     return fma(fma(-quotient, b, a), inverse, quotient);

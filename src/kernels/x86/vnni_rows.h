@@ -14,7 +14,7 @@ template <int kStrips>
 struct VnniRows {
   static constexpr int kRows = 6, kColumns = kStrips * static_cast<int>(Int8Panels::kColumns);
 
-  /// As a tile of Int8Loop.
+  /// The same as `multiply` of a tile of Int8Loop, without `between`.
   template <class Strips>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
                        std::int32_t* sums, bool add) {
@@ -25,7 +25,7 @@ struct VnniRows {
   static VLA_INLINE void add_products(__m512i& sum, __m512i numbers, __m512i codes) {
 #ifdef VLA_EMULATED_INSTRUCTIONS  // in plain C++ for tests
     sum = _mm512_dpbusd_epi32(sum, numbers, codes);
-#else  // from the intrinsic, compilers copy every sum
+#else  // with the intrinsic, compilers copy every sum
     asm("vpdpbusd %2, %1, %0" : "+v"(sum) : "v"(numbers), "v"(codes));
 #endif
   }

@@ -25,7 +25,8 @@ Multiplier multiplier_of(const CpuWeights& weights, const Param& matrix) {
   return {&kernel, kernel.max_norm, kernel.takes_windows, kernel.takes_windows, &weights.encoding(&matrix)};
 }
 
-/// The widest head for which the attention kernels have room.
+/// Checks the head width and the number of key segments against the attention kernels' limits. Errors: unsupported,
+/// internal.
 Status check_attention(const Graph& graph) {
   for (const Node& node : graph.nodes()) {
     const auto* attention = node.as<op::Attention>();
@@ -99,7 +100,7 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
   choose_blocks(l);
   arrange(l, l.ops);
   if (l.arena_size > arena_.size()) {
-    // Programs that exist keep the arena that they were given.
+    // Earlier programs keep their own arena.
     VLA_TRY(arena_, Memory::allocate(l.arena_size, "working memory"));
   }
   return CpuProgram::make(l, arena_, executor_, clock_);

@@ -49,7 +49,7 @@ class CpuDevice final : public Device {
   std::shared_ptr<kernels::Executor> executor_;
   std::shared_ptr<kernels::KindClock> clock_ = std::make_shared<kernels::KindClock>();
   CpuWeights weights_;
-  Memory arena_;  // values that live within a run; all programs share it, since one runs at a time
+  Memory arena_;  // memory for the values of one run; all programs share it, since one runs at a time
 };
 
 }  // namespace vla::lower

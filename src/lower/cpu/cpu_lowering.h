@@ -6,18 +6,18 @@
 #include "lower/cpu/cpu_weights.h"
 #include "lower/ops.h"
 
-/// The CPU's passes: choose each value's layout, join products into cache-sized blocks of rows, make a task of each
+/// The CPU's passes: choose each value's layout, join products into cache-sized blocks of rows, make a task for each
 /// operation.
 namespace vla::lower {
 
 struct CpuOp;
-/// Two products, as in an MLP, where only the second reads the result of the first. A thread takes one block of rows
-/// through both, so that the intermediate elements stay in its cache, in its own scratch memory.
+/// Two products, as in an MLP, where only the second reads the result of the first. A thread computes both products for
+/// one block of rows, so that the intermediate elements stay in its cache, in its own scratch memory.
 struct BlockedOp {
   std::vector<CpuOp> products;
   std::int64_t n_block;
 
-  std::string text() const { return ""; }  // each product has its own
+  std::string text() const { return ""; }  // each product prints its own line
   double flop() const;
 };
 
@@ -30,7 +30,7 @@ struct CpuLowering : Lowering {
   Features use;
   int n_thread;
   std::vector<CpuOp> ops = {};
-  std::vector<std::byte*> data = {};  // of each base, once memory is allocated
+  std::vector<std::byte*> data = {};  // address of each base, once memory is allocated
 
   Features features(bool rounds) const { return rounds ? use : without_rounding(use); }
   std::byte* address(ValueId base) const { return data[static_cast<std::size_t>(base)]; }

@@ -46,7 +46,7 @@ Status CpuProgram::give_addresses(CpuLowering& l) {
       case Value::Placement::thread:
         break;
     }
-    return nullptr;  // a thread's own
+    return nullptr;  // thread: scratch memory of each worker
   };
   for (std::size_t i = 0; i < l.values.size(); ++i) {
     const Value& value = l.values[i];
@@ -118,7 +118,7 @@ Status CpuProgram::cut(const CpuWeights& weights) {
 Status CpuProgram::prepare() { return run(prepare_); }
 Status CpuProgram::run() { return run(run_); }
 
-/// Reads the matrices' addresses from the table.
+/// Copies the matrices' current addresses from the table into the tasks.
 void CpuProgram::bind() const {
   for (const MatrixUses& phase : uses_)
     for (const auto& [part, matrix] : phase) {
@@ -139,7 +139,7 @@ Status CpuProgram::run(const std::vector<Segment>& segments) {
   return {};
 }
 
-/// Stops after each phase that makes a tapped value, since the next phase may overwrite it.
+/// Pauses after each phase that makes a tapped value to report the value, since the next phase may overwrite it.
 void CpuProgram::run_phases(std::size_t begin, std::size_t end) {
   for (auto next = seen_.lower_bound(begin); begin < end;) {
     const std::size_t stop = next != seen_.end() ? std::min(end, next->first + 1) : end;

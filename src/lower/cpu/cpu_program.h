@@ -22,8 +22,8 @@ class CpuProgram final : public Program {
   Status run() override;
   const std::vector<Stage>& stages() const override { return stages_; }
   std::vector<Work> work() const override { return work_; }
-  /// Times one phase of each kind and predicts the run from them. Overwrites the program's memory, so call it only for
-  /// a program that was lowered to get its sizes. Adds the time to read weights from memory.
+  /// Times one phase of each kind, predicts the run from these times and adds the time to read the weights from memory.
+  /// Overwrites the program's memory, so call it only for a program that was lowered to get its sizes.
   std::vector<Prediction> predictions() const override;
   const std::vector<Tap>& taps() const override { return taps_; }
   std::vector<float> tap(std::size_t i) const override;
@@ -52,12 +52,12 @@ class CpuProgram final : public Program {
   std::shared_ptr<const Tables> tables_;
   Memory arena_, own_;  // own: constants, and the results of prepare
   std::shared_ptr<const WeightTable> weights_;
-  std::vector<MatrixUses> uses_;  // of each phase
+  std::vector<MatrixUses> uses_;  // by phase
   MatrixReads reads_;
-  mutable std::uint64_t bound_ = 0;  // the version of the address table that the tasks last read
+  mutable std::uint64_t bound_ = 0;  // version of the address table that was last copied into the tasks
   std::vector<std::unique_ptr<kernels::Task>> tasks_;
   std::vector<kernels::Phase> phases_;
-  /// What a prediction needs to know about a phase.
+  /// The properties of a phase that a prediction uses.
   struct Counted {
     int kind = 0;           // phases of equal duration share a number, given in order of first appearance
     std::size_t entry = 0;  // index into `predictions`
@@ -71,8 +71,8 @@ class CpuProgram final : public Program {
   std::vector<Work> work_;
   std::vector<Tap> taps_;
   std::vector<TapPlace> tap_places_;
-  TapVisitor see_tap_;                                                 // sees tapped values in place
-  std::multimap<std::size_t, std::pair<std::string, TapPlace>> seen_;  // keyed by the phase that makes them
+  TapVisitor see_tap_;                                                 // receives tapped values during a run
+  std::multimap<std::size_t, std::pair<std::string, TapPlace>> seen_;  // tapped values by the phase that makes them
   std::string text_;
 };
 

@@ -15,7 +15,7 @@
 namespace vla::lower {
 namespace {
 
-/// The number of threads that read streamed matrices, beside `n_thread` that compute.
+/// The number of threads that read streamed matrices, in addition to the `n_thread` that compute.
 int n_reader(int n_thread) { return std::max(1, n_thread / 4); }
 
 std::string describe(const std::map<std::string, std::map<std::string, int>>& counts) {
@@ -58,7 +58,7 @@ Status CpuWeights::choose(const ParamList& list, const Options& options) {
       place.encoding = resident_encoding(param, options.rounding);
       place.kernel = kernels::choose_linear({place.encoding.type, param.shape[0], param.shape[1]}, options.use);
       place.packing = {place.kernel->packed_size, place.kernel->pack};
-      if (param.scales == nullptr) place.n_scale = place.encoding.n_scale(param.count());  // they are made
+      if (param.scales == nullptr) place.n_scale = place.encoding.n_scale(param.count());  // computed at load
       ++counts[place.kernel->name][dtype_name(param.encoding.type)];
     } else if (param.storage == Storage::table && param.source != nullptr) {
       VLA_TRY(std::unique_ptr<TableRows> rows, TableRows::make(*list.bundle(), param));
@@ -103,7 +103,7 @@ Status CpuWeights::give_places(const ParamList& list, const Options& options, co
   return {};
 }
 
-/// Reads what is resident.
+/// Reads and packs the resident parameters.
 Status CpuWeights::fill(const ParamList& list, const WeightPlan& plan, int n_thread) const {
   std::vector<PackPart> parts;
   for (const Param& param : list.params()) {
@@ -127,7 +127,7 @@ Status CpuWeights::fill(const ParamList& list, const WeightPlan& plan, int n_thr
   const kernels::Phase phase = {{task.get()}, nullptr};
   executor->run({&phase, 1});
   if (has_failed) return content.changed();
-  if (!plan.streamed.empty())  // drop from the page cache what is now packed in memory
+  if (!plan.streamed.empty())  // free the page cache of bytes that are packed in memory
     for (const PackPart& part : parts) content.forget(part.from);
   return {};
 }

@@ -45,7 +45,7 @@ class CpuWeights {
 
   const std::byte* data(const Param* param) const { return table_->at(param).data; }
   const float* floats(const Param* vector) const { return reinterpret_cast<const float*>(data(vector)); }
-  /// How it lies in memory.
+  /// The encoding of a parameter in memory.
   const Encoding& encoding(const Param* param) const { return place(param).encoding; }
   /// Returns the kernel that multiplies by a matrix.
   const kernels::LinearKernel* kernel(const Param* matrix) const { return place(matrix).kernel; }
@@ -53,7 +53,7 @@ class CpuWeights {
   std::size_t size_of(const Param& matrix) const { return place(&matrix).size_of(matrix); }
   /// The streamed group of each parameter, by Param::id; -1 if it is resident.
   const std::vector<int>& groups() const { return groups_; }
-  /// The stream of these groups; null if there are none or the weights were not read.
+  /// The stream of the groups; null if there are none or the weights were not read.
   const std::shared_ptr<WeightStream>& stream() const { return stream_; }
   /// The address table of all parameters, which programs keep.
   const std::shared_ptr<WeightTable>& table() const { return table_; }
@@ -64,16 +64,16 @@ class CpuWeights {
     const auto found = tables_->find(table);
     return found != tables_->end() ? found->second.get() : nullptr;
   }
-  /// Whether matrices of floats become int8 codes here, or are stored so.
+  /// Whether any matrix is int8 or int4 codes in memory.
   bool has_int8() const;
-  /// Bytes in memory. A table counts with the rows that may be cached, a streamed matrix with its windows.
+  /// Bytes in memory, including the row caches of tables and the windows for streamed matrices.
   std::size_t size() const { return memory_.size() + table_size_; }
   /// The kernels, and how many matrices each multiplies, for display: `avx2 (98 bf16)`.
   const std::string& text() const { return text_; }
 
  private:
   struct Place : MatrixPlace {
-    const kernels::LinearKernel* kernel = nullptr;  // of a matrix
+    const kernels::LinearKernel* kernel = nullptr;  // null unless a matrix
   };
   const Place& place(const Param* param) const { return places_[static_cast<std::size_t>(param->id)]; }
   Place& place(const Param* param) { return places_[static_cast<std::size_t>(param->id)]; }

@@ -11,9 +11,9 @@
 namespace vla::lower {
 namespace {
 
-/// FLOP below which a product takes no longer than waking a thread.
+/// FLOP below which a product takes less time than waking a thread.
 constexpr double kMinSharedFlop = 2e6;
-/// Elements per item of an operation that is no product.
+/// Elements per item of an operation that is not a product.
 constexpr std::int64_t kItemElements = 16384;
 
 template <class Op>
@@ -68,8 +68,8 @@ std::string text_of(const CpuLowering& l, const CpuOp& op, const CpuRun& run) {
   return std::visit([&](const auto& what) { return lines_of(l, op, run, what); }, op.op);
 }
 
-/// Drops the numbers that only tell places apart: the phase at the start of a line, a layer's after a dot, a value's
-/// after %.
+/// Drops the numbers that identify one instance of an operation: the phase at the start of a line, a layer number after
+/// a dot, and a value's id after %.
 std::string likeness_of(std::string_view text) {
   std::string likeness;
   bool in_place = true;  // digits here are dropped

@@ -32,8 +32,8 @@ struct CpuRun {
   std::string kernel;          // kernel name in a printed program
   KindClock::Kind kind;        // the clock that its time is added to
   std::size_t scratch;         // bytes of scratch memory per worker
-  std::unique_ptr<Task> task;  // run by the executor; all addresses are set but those of matrices
-  MatrixUses matrices = {};    // their addresses are set before each run
+  std::unique_ptr<Task> task;  // for the executor; all addresses are set except those of matrices
+  MatrixUses matrices = {};    // matrices whose addresses are set before a run
 };
 #define VLA_RUN_OP(Op) CpuRun run_of(const CpuLowering& l, const CpuOp& op, const Op& what);
 VLA_LOWERED_OPS(VLA_RUN_OP)
@@ -41,13 +41,13 @@ VLA_RUN_OP(PackOp)
 VLA_RUN_OP(BlockedOp)
 #undef VLA_RUN_OP
 
-/// Call it once every value has an address.
+/// Requires that every value has an address.
 CpuRun run_of(const CpuLowering& l, const CpuOp& op);
 /// FLOP and bytes of an operation.
 Work work_of(const CpuLowering& l, const CpuOp& op);
 /// Prints an operation: text, kernel, shapes and layouts.
 std::string text_of(const CpuLowering& l, const CpuOp& op, const CpuRun& run);
-/// The same line without the numbers that tell places apart: operations with equal lines take the same time.
+/// The text without phase, layer and value numbers: operations with equal results take the same time.
 std::string likeness_of(std::string_view text);
 
 // Shared by the files of lower/cpu/ops.
@@ -77,11 +77,11 @@ inline kernels::RowKernel norm_kernel(const CpuLowering& l, const op::Norm& norm
 }
 kernels::LinearJob::Norm norm_of(const CpuLowering& l, const Node* norm, ValueId weight, ValueId bias);
 kernels::Window window_of(const Shape& x, const op::Window& window, const Shape& y);
-/// How many threads share an operation of this FLOP.
+/// The number of threads that share an operation of this many FLOP.
 int threads_for(const CpuLowering& l, double flop);
-/// The sizes of a PackJob, without addresses.
+/// A PackJob with its sizes but no addresses.
 kernels::PackJob pack_sizes(const CpuLowering& l, const PackOp& op);
-/// The job of a product, and the fields for its matrices' addresses.
+/// The job of a product, without the addresses of its matrices; `note_uses` lists the fields that hold these addresses.
 kernels::LinearJob job_of(const CpuLowering& l, const CpuOp& op, const LinearOp& linear);
 void note_uses(const LinearOp& linear, kernels::LinearJob& job, MatrixUses& uses);
 

@@ -79,8 +79,8 @@ class CpuLayouts final : Layouts {
     y.size = static_cast<std::size_t>(kernels::rounded_count(layout, count(y.shape) / y.shape[0], y.shape[0])) * 2;
   }
 
-  /// Whether an operation can read a value, or a view of it, rounded: a product reads the whole value; attention reads
-  /// rows of heads that it neither norms nor rotates first.
+  /// Whether an operation can read a value, or a view of it, in a rounded layout: a product must read the whole value;
+  /// attention must read rows of heads without a norm or rotation.
   bool takes(const CpuOp& op, ValueId id, kernels::RoundedLayout layout) const {
     if (const auto* linear = std::get_if<LinearOp>(&op.op))
       return id == linear->x && id == l.value(id).base && linear->norm == nullptr && linear->unfold == nullptr &&

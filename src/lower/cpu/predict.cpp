@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Predicts how long a program takes on this machine. One phase of each kind is timed, in the program's order, and
-// counted as often as it occurs: of a network of equal blocks, one block is timed. The weights read as zeros and so
-// come from a cache; the time to read them from memory is added.
+// counted as often as it occurs: in a network of equal blocks, one block is timed. The weights are zeros and come from
+// a cache, so the time to read them from memory is added.
 #include <algorithm>
 #include <chrono>
 #include <limits>
@@ -20,7 +20,7 @@ using Seconds = std::chrono::duration<double>;
 
 // Runs of the chosen phases, after one run that touches the memory for the first time.
 constexpr int kMinRuns = 3, kMaxRuns = 50;
-constexpr double kWanted = 0.2;         // seconds; phases run more often than kMinRuns until it is spent
+constexpr double kWanted = 0.2;         // seconds; after kMinRuns, runs continue until this time has passed
 constexpr double kBandwidthTime = 0.1;  // seconds
 
 }  // namespace
@@ -28,7 +28,7 @@ constexpr double kBandwidthTime = 0.1;  // seconds
 /// Takes the fastest of several runs, to exclude the time of other programs. Times the second phase of each kind, since
 /// the first may follow something that occurs only once.
 std::vector<double> CpuProgram::seconds_of_kinds() const {
-  std::vector<std::size_t> chosen;  // by kind
+  std::vector<std::size_t> chosen;  // by kind, the phase that is timed
   std::vector<int> n_met;
   for (std::size_t i = 0; i < counted_.size(); ++i) {
     const auto kind = static_cast<std::size_t>(counted_[i].kind);

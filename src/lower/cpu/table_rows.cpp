@@ -10,7 +10,7 @@ namespace vla::lower {
 namespace {
 
 constexpr std::int64_t kMostKept = 1024, kNoRow = -1;
-/// Places in which a row may be cached.
+/// How many cache places are tried for a row.
 constexpr std::int64_t kTries = 16;
 
 }  // namespace
@@ -26,7 +26,8 @@ Result<std::unique_ptr<TableRows>> TableRows::make(const Bundle& bundle, const P
   return rows;
 }
 
-/// The cache place for row i; `index_` says which row it holds.
+/// Returns the cache place that holds row i, after reading the row if it is not cached; null if the file no longer has
+/// the row.
 std::byte* TableRows::place(std::int64_t i) {
   const auto n = static_cast<std::int64_t>(index_.size());
   std::int64_t at = i % n;

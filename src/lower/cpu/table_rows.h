@@ -11,7 +11,7 @@
 namespace vla::lower {
 
 /// Rows of an embedding table that stays in the bundle's file: an observation reads few rows of a vocabulary. A row is
-/// read at its first lookup, and the last thousand are cached. Safe for several threads.
+/// read at its first lookup, and up to 1024 rows are cached. Safe for several threads.
 class TableRows {
  public:
   /// Errors: out_of_memory.

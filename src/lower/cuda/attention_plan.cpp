@@ -13,17 +13,17 @@ std::int64_t count_keys(const AttentionOp& op) {
 }
 
 /// Cost model of attention, in microseconds and rates per microsecond, fitted to 218 measurements on an H200 (every
-/// shape and number of shares for 13 sizes of four policies; 85 % are within a quarter).
+/// shape and number of shares for 13 sizes of four policies; 85 % of the estimates are within 25 % of the measurement).
 struct Rates {
-  double tile;      // of keys, beside its products
-  double products;  // of queries, keys and elements in a block
+  double tile;      // time of a tile of keys, without its products
+  double products;  // rate of a block: query rows x keys x elements of a head
   double further;   // the fraction of a block's time that each further block on an SM adds
 };
 constexpr Rates kOneGroup = {.tile = 0.43, .products = 300e3, .further = 0.38},
                 kSharedKeys = {.tile = 1.5, .products = 750e3, .further = 0.83};
-/// Start of a block with its first loads; the kernel that combines shares of the keys.
+/// kBegin: time to start a block, with its first loads. kFinish: time of the kernel that combines shares of the keys.
 constexpr double kBegin = 2.9, kFinish = 2.7;
-/// Bytes of partial sums that one SM moves.
+/// Bytes of partial sums that one SM moves per microsecond.
 constexpr double kPartial = 12.4e3;
 
 double microseconds(const cuda::AttentionShape& shape, std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit,

@@ -14,7 +14,7 @@ constexpr std::int64_t kNoLimit = std::numeric_limits<std::int64_t>::max();
 /// Fewest keys of attention in bf16. Over fewer keys rounding errors do not cancel, and float32 takes little time.
 constexpr std::int64_t kMinRoundedKeys = 32;
 
-/// Kernels that round x apply its norm, too.
+/// Kernels that convert x also apply its norm; float32 kernels apply none.
 Multiplier multiplier_of(const CudaWeight& weight) {
   static constexpr char kKinds[static_cast<int>(MatrixKind::int8) + 1] =
       {};  // distinct addresses, to tell kernels apart
@@ -42,7 +42,7 @@ Result<std::unique_ptr<Device>> CudaDevice::model(const std::string& name, Round
 Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan& plan) {
   if (model_ && fill) return Error{Code::usage, "model", "a device that is there", name_, "it says times alone"};
   queue_->set_dry(!fill);
-  arena_.reset();  // a dry load leaves one without memory
+  arena_.reset();  // after a dry load the arena has no memory
   VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, plan, queue_));
   // Attention rounds if products do.
   const bool rounds =
@@ -115,7 +115,7 @@ Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const Low
   store(l, ops);
   choose_layouts(l, std::move(ops));
   arrange(l, l.ops);
-  if (!arena_ || l.arena_size > arena_->size()) {  // programs that exist keep the arena that they were given
+  if (!arena_ || l.arena_size > arena_->size()) {  // earlier programs keep their own arena
     VLA_TRY(arena_, queue_->allocate(l.arena_size, "working memory"));
   }
   return CudaProgram::make(l, queue_, {weights_.memory(), arena_}, model_ ? &*model_ : nullptr);

@@ -12,10 +12,10 @@ namespace vla::lower {
 /// A GPU that runs our own kernels (cuda/kernels). An act is one captured graph.
 class CudaDevice final : public Device {
  public:
-  /// modules: the kernels' PTX. at_load: see CudaWeights::load. Errors: device, unsupported for int4.
+  /// modules: the kernels' PTX. at_load: see CudaWeights::load. Errors: device.
   static Result<std::unique_ptr<Device>> open(const cuda::Driver& driver, int index,
                                               const std::vector<std::string>& modules, Rounding at_load);
-  /// Models a GPU that is not present (DeviceLibrary::model). Errors: usage for an unknown name, unsupported.
+  /// Models a GPU that is not present (DeviceLibrary::model). Errors: usage for an unknown name.
   static Result<std::unique_ptr<Device>> model(const std::string& name, Rounding at_load);
 
   Status load(const ParamList& params, bool fill, const WeightPlan& plan) override;

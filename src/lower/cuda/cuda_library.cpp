@@ -9,7 +9,7 @@
 namespace vla {
 namespace {
 
-/// Loaded once.
+/// Returns the CUDA driver, which is loaded once.
 const Result<cuda::Driver>& driver() {
   static const Result<cuda::Driver> loaded = cuda::load_driver();
   return loaded;

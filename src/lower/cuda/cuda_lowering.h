@@ -9,7 +9,7 @@
 #include "lower/cuda/cuda_weights.h"
 #include "lower/ops.h"
 
-/// A GPU's passes: copy operands that kernels need contiguous, and make launches of each operation.
+/// A GPU's passes: copy operands that kernels need contiguous, and make the launches of each operation.
 namespace vla::lower {
 
 /// Norms and rotates rows of heads for attention, and converts them to bf16 if attention reads that.
@@ -20,8 +20,8 @@ struct HeadOp {
   double flop() const { return 0; }
 };
 
-/// How a product is cut into blocks: tiles of 128 or 64 rows; for few rows a shape bound by reading the matrix; strips
-/// of some columns of up to 64 rows; or a Hopper tile. Also into how many shares the depth is split.
+/// The blocks that a product is cut into. few: for few rows, bound by reading the matrix. strip16 to strip128: strips
+/// of that many columns and up to 64 rows. rows64, rows128: tiles of that many rows. hopper: a Hopper tile.
 enum class ProductShape { few, strip16, strip32, strip64, strip128, rows64, rows128, hopper };
 /// Columns of a strip; 0 for other shapes.
 constexpr std::int64_t strip_width(ProductShape shape) {
@@ -31,6 +31,7 @@ constexpr std::int64_t strip_width(ProductShape shape) {
          : shape == ProductShape::strip128 ? 128
                                            : 0;
 }
+/// A product's block shape and the number of shares that its depth is split into.
 struct ProductCut {
   ProductShape shape = ProductShape::few;
   int n_split = 1;       // shares of the depth, each with its own blocks
@@ -46,23 +47,23 @@ struct AttentionPlan {
 
 struct CudaOp : Step {
   AnyOp<HeadOp> op;
-  ProductCut cut = {};      // of a LinearOp
-  AttentionPlan plan = {};  // of an AttentionOp
+  ProductCut cut = {};      // LinearOp only
+  AttentionPlan plan = {};  // AttentionOp only
   ValueId gate = kNone;     // the gate product's result, if no kernel computes gate and up together
   ValueId partial = kNone;  // partial results of the shares of the depth or of the keys
-  std::shared_ptr<const CudaOp> finishes = nullptr;  // of a norm: the product whose shares of the depth it adds first
+  std::shared_ptr<const CudaOp> finishes = nullptr;  // norms only: the product whose depth shares are added first
 };
-/// Whether another operation adds a product's shares of the depth.
+/// Whether another operation adds the depth shares of this product.
 inline bool leaves_shares(const CudaOp& op) { return op.partial != kNone && op.writes[0] == op.partial; }
 
 struct CudaLowering : Lowering {
   const CudaWeights& weights;
-  int n_sm;  // blocks that run at a time
+  int n_sm;  // SMs of the device
   bool is_hopper;
   std::vector<CudaOp> ops = {};
-  std::vector<cuda::Address> data = {};  // of each base, once memory is allocated
+  std::vector<cuda::Address> data = {};  // address of each base, once memory is allocated
 
-  /// A value that is not float32 must be a whole base.
+  /// The address of a value. A value that is not float32 must be a whole base.
   cuda::Address address(ValueId id) const {
     const Value& v = value(id);
     return data[static_cast<std::size_t>(v.base)] + static_cast<cuda::Address>(v.offset) * 4;
@@ -78,24 +79,26 @@ struct CudaLowering : Lowering {
   const CudaWeight& matrix(const Node& linear) const { return weights[*linear.as<op::Linear>()->weight]; }
 };
 
-/// Makes operands readable for the kernels: copies those of the wrong layout, converts inputs of bf16 and int8
-/// products, norms and rotates heads before attention (which reads keys and values in place, or as bf16). A value with
-/// only such readers is stored rounded. Also splits the depth of products, and has norms add its shares.
+/// Makes operands readable for the kernels: copies operands with a wrong layout, converts the inputs of bf16 and int8
+/// products, and norms and rotates heads before attention. Attention reads keys and values in place, or as bf16. A
+/// value whose only reader is such a conversion is stored converted. Also splits the depth of products, and lets norms
+/// add the shares.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 
 /// The strip width, 16 to 64, for several products in one launch without split depth.
 unsigned common_width(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
-/// Which tables of Hopper's tiles a product may be cut by: those of both matrices of a gated product, or of several
-/// products in one launch.
+/// What a Hopper tile computes: one product, both products of a gated MLP, or several products in one launch. Each has
+/// its own set of tiles.
 enum class HopperCutFor { one, gated, several };
-/// The Hopper tile with the shortest estimated time. n_column: of all products together.
+/// The Hopper tile with the shortest estimated time. n_column: columns of all products together.
 ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
                           HopperCutFor what, int n_sm);
-/// is_gated: one kernel computes gate and up, which have n_column columns together.
+/// Chooses the fastest cut. is_gated: one kernel computes gate and up, which have n_column columns together.
 ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
                        std::int64_t depth, bool is_gated);
 
-/// The tensor-core plan with the shortest estimated time. n_row: query rows of each of the n_unit key heads of a batch.
+/// The tensor-core plan with the shortest estimated time. n_row: query rows per key head. n_unit: key heads of the
+/// whole batch.
 AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key,
                              int n_sm);
 AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op);

@@ -62,7 +62,7 @@ CudaProgram::~CudaProgram() {
 Status CudaProgram::run(const std::vector<Piece>& pieces) {
   for (const Piece& piece : pieces) {
     if (piece.groups.any()) {
-      VLA_CHECK(queue_->flush());  // the device computes already while these are copied
+      VLA_CHECK(queue_->flush());  // the device computes queued work while the groups are copied
       VLA_CHECK(windows_->bring(piece.groups));
     }
     VLA_CHECK(queue_->run(piece.part));
@@ -90,7 +90,7 @@ Result<std::vector<int>> CudaProgram::make_parts(const CudaLowering& l) {
   VLA_TRY(const std::vector<Groups> groups, find_groups(reads_, l.weights.groups()));
   prepare_ = pieces(cut_phases(std::span(groups).first(n_prepare_), 0), phases);
   run_ = pieces(cut_phases(std::span(groups).subspan(n_prepare_), n_prepare_), phases);
-  if (run_.empty()) run_.emplace_back();  // for marks
+  if (run_.empty()) run_.emplace_back();  // marks need a piece
   return n_launch;
 }
 
@@ -105,7 +105,7 @@ std::vector<CudaProgram::Piece> CudaProgram::pieces(const std::vector<Segment>& 
   return pieces;
 }
 
-/// Marks the end of each stage's last phase, and the end.
+/// Marks the end of each stage's last phase, and the end of the run.
 Status CudaProgram::make_marks(const CudaLowering& l) {
   const std::size_t n_run = reads_.size() - n_prepare_;
   std::vector<std::size_t> ends(stages_.size(), 0);

@@ -45,7 +45,7 @@ class CudaProgram final : public Program {
   static std::vector<Piece> pieces(const std::vector<Segment>& segments, std::vector<std::vector<Calls>>& phases);
   Status run(const std::vector<Piece>& pieces);
   Status give_addresses(CudaLowering& l, const cuda::Buffer& arena);
-  /// The number of kernels per operation.
+  /// Makes the launches of prepare and run. Returns the number of kernels per operation.
   Result<std::vector<int>> make_parts(const CudaLowering& l);
   Status make_marks(const CudaLowering& l);
   void make_taps(const CudaLowering& l);
@@ -54,7 +54,7 @@ class CudaProgram final : public Program {
   std::vector<std::shared_ptr<cuda::Buffer>> memory_;  // weights and arena
   std::shared_ptr<cuda::Buffer> own_;                  // results of prepare, and constants
   std::shared_ptr<DeviceWindows> windows_;             // null if all matrices are resident
-  std::vector<Piece> prepare_, run_;                   // one, or several if weights are streamed
+  std::vector<Piece> prepare_, run_;                   // one piece each, or several if weights are streamed
   MatrixReads reads_;
   std::size_t n_prepare_ = 0;
   std::vector<Stage> stages_;

@@ -11,11 +11,11 @@ namespace {
 /// Streams that a captured graph forks into: at most three products share an x, and four small kernels do not fill a
 /// device.
 constexpr std::size_t kStreams = 4;
-/// Most nodes of a graph; drivers run out of memory beyond. A longer act is several launches.
+/// Most nodes of a graph; drivers run out of memory with more. A longer act takes several launches.
 constexpr std::size_t kMaxLaunches = 20000;
-/// Alignment of slots; a smaller gap between two slots is padding.
+/// Alignment of slots: a smaller gap between two uploads is padding, so one copy joins them.
 constexpr std::size_t kPadding = 256;
-/// Room behind images for what else an act uploads: tokens, state and noise.
+/// Capacity after the images for the other uploads of an act: tokens, state and noise.
 constexpr std::size_t kRoom = std::size_t{256} << 10;
 
 std::size_t n_launch(const CudaPart& part) {
@@ -56,7 +56,7 @@ Result<std::shared_ptr<cuda::Buffer>> CudaQueue::allocate(std::size_t size, cons
   VLA_CHECK(failure_);
   Result<cuda::Buffer> made = gpu_->allocate(size, what);
   if (made) return std::make_shared<cuda::Buffer>(std::move(*made));
-  // Out of memory may pass; a failed device stays failed.
+  // Lack of memory may be temporary; a failed device stays failed.
   if (made.error().code != Code::out_of_memory) static_cast<void>(keep(made.error()));
   return made.error();
 }
@@ -138,7 +138,7 @@ std::shared_ptr<std::byte> CudaQueue::host_memory(std::size_t size) {
     std::byte* begin = (*made)->memory.at(0);
     return {std::move(*made), begin};
   }
-  // Without such memory, bytes are copied to what the queue has.
+  // Without page-locked memory, `set` copies the bytes to the staging buffer.
   if (made.error().code != Code::out_of_memory && block_failure_) block_failure_ = made.error();
   return nullptr;
 }
@@ -248,7 +248,7 @@ Status CudaQueue::wait() {
   return {};
 }
 
-/// Device times are counted back from the end of the wait.
+/// Converts the marks' device times to host times, relative to the end of the wait.
 Status CudaQueue::note_times() {
   const auto now = std::chrono::steady_clock::now();
   const Parts parts = std::move(launched_);
@@ -274,7 +274,7 @@ Status CudaQueue::capture(const Parts& parts) {
   return {};
 }
 
-/// The operations of a phase are spread over the streams.
+/// Spreads the operations of each phase over the streams.
 Status CudaQueue::capture(const CudaPart& part) {
   auto mark = part.marks.begin();
   for (std::size_t phase = 0; phase <= part.phases.size(); ++phase) {

@@ -31,7 +31,7 @@ using Calls = std::vector<Call>;
 /// Phases that are launched together, in order; the operations of a phase are independent.
 struct CudaPart {
   using Time = std::chrono::steady_clock::time_point;
-  /// Requests a timestamp after this many phases.
+  /// Requests a timestamp after `n_phase` phases.
   struct Mark {
     std::size_t n_phase;
     cuda::Owned event;
@@ -64,20 +64,20 @@ class CudaQueue {
   /// Allocates device memory; free it before the queue is destroyed.
   Result<std::shared_ptr<cuda::Buffer>> allocate(std::size_t size, const std::string& what);
   Status fill_zeros(const cuda::Buffer& memory);
-  /// For a mark.
+  /// Creates an event for a mark.
   Result<cuda::Owned> event();
-  /// Memory that the device reads by itself, and that outlives the queue. Any thread may ask for it. Null if the queue
-  /// is dry or memory is short; a failure is kept by the next call.
+  /// Allocates page-locked memory that the device reads directly and that may outlive the queue. Safe for any thread.
+  /// Null if the queue is dry or memory is short. The next `set` records any other failure.
   std::shared_ptr<std::byte> host_memory(std::size_t size);
-  /// Copies bytes to the device before the next launch. `from` may be reused at once; of `host_memory` it is read when
-  /// the copy runs. Adjacent copies are joined.
+  /// Copies bytes to the device before the next launch. `from` may be reused at once, except in `host_memory`, which is
+  /// read when the copy runs. Adjacent copies are joined.
   void set(cuda::Address to, const void* from, std::size_t size);
   /// Sends bytes ahead of the act that reads them, from any thread. Null if the queue is dry or memory is short.
   std::unique_ptr<CudaSent> send(const void* data, std::size_t size);
   void take(cuda::Address to, const CudaSent& sent, std::size_t size);
   /// Like `set`, but copies at once; for large inputs.
   Status upload(cuda::Address to, const void* from, std::size_t size);
-  /// Queues a part, which must live until it is forgotten.
+  /// Queues a part, which must live until `forget`.
   Status run(const CudaPart& part);
   /// Copies bytes from the device after all queued work; afterwards the marks have their times.
   void get(void* to, cuda::Address from, std::size_t size);
@@ -85,24 +85,24 @@ class CudaQueue {
   Status flush();
   /// Records `event` after all launched work.
   Status record(const cuda::Owned& event);
-  /// Keeps the device's first failure, also those of other streams.
+  /// Keeps the device's first failure, also one on another stream, and returns `status`.
   Status keep(Status status);
   /// Null if the queue has no device.
   const std::shared_ptr<cuda::Gpu>& gpu() const { return gpu_; }
-  /// A part that goes.
+  /// Removes a part and the graphs that contain it, after waiting for its queued or launched work.
   void forget(const CudaPart& part);
 
  private:
   using Parts = std::vector<const CudaPart*>;
   explicit CudaQueue(std::shared_ptr<cuda::Gpu> gpu)
       : n_sm_(gpu->n_sm()), is_hopper_(gpu->is_hopper()), is_dry_(false), gpu_(std::move(gpu)) {}
-  /// Page-locked host memory that the device accesses itself.
+  /// Page-locked host memory that the device accesses directly.
   struct HostMemory {
     cuda::Owned memory;
     std::size_t size = 0;
     std::byte* at(std::size_t offset) const { return static_cast<std::byte*>(memory.get()) + offset; }
   };
-  /// What host_memory() gave, with room behind it for the other inputs of an act, which go up with it.
+  /// The memory of one host_memory() call, followed by capacity for the act's other inputs, which are uploaded with it.
   struct HostBlock {
     std::shared_ptr<cuda::Gpu> gpu;
     HostMemory memory = {};
@@ -113,7 +113,7 @@ class CudaQueue {
     cuda::Address to;
     std::byte* from;
     std::size_t size;
-    std::shared_ptr<HostBlock> block;  // that `from` lies in; null: staging_
+    std::shared_ptr<HostBlock> block;  // the block that holds `from`; null: staging_
   };
 
   Status grow(HostMemory& memory, std::size_t size);
@@ -136,7 +136,7 @@ class CudaQueue {
   std::shared_ptr<cuda::Gpu> gpu_;
   std::unique_ptr<cuda::Stream> main_;
   std::vector<cuda::Stream> side_;
-  cuda::Owned end_;  // of a graph
+  cuda::Owned end_;  // recorded at the end of every graph
   std::shared_ptr<CudaSender> sender_;
   HostMemory staging_, landing_;
   std::size_t n_staged_ = 0;  // bytes that queued copies still read
@@ -146,7 +146,7 @@ class CudaQueue {
   std::vector<std::weak_ptr<HostBlock>> blocks_;
   Status block_failure_;
   Parts pending_, launched_;
-  std::size_t n_pending_ = 0;  // launches
+  std::size_t n_pending_ = 0;  // launches of pending_
   std::map<Parts, cuda::Owned> graphs_;
   Status failure_;
 };

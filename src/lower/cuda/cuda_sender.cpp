@@ -19,7 +19,8 @@ std::unique_ptr<CudaSent> CudaSender::send(const void* data, std::size_t size) {
   return std::unique_ptr<CudaSent>(new CudaSent(shared_from_this(), std::move(parcel)));
 }
 
-/// Reuses a parcel whose old bytes are no longer needed. They may still be in transit: the stream keeps the order.
+/// Reuses a parcel whose old bytes are no longer needed. The old bytes may still be in transit: the stream keeps the
+/// copies in order.
 Result<std::unique_ptr<CudaSender::Parcel>> CudaSender::start(const void* data, std::size_t size) {
   VLA_CHECK(gpu_->use());
   VLA_TRY(std::unique_ptr<Parcel> parcel, take(size));
@@ -42,7 +43,7 @@ Result<std::unique_ptr<CudaSender::Parcel>> CudaSender::take(std::size_t size) {
   VLA_TRY(cuda::Owned arrived, gpu_->event(false));
   {
     const std::lock_guard lock(mutex_);
-    idle_.reserve(++n_made_);  // freeing cannot fail
+    idle_.reserve(++n_made_);  // so that give_back cannot fail
   }
   return std::unique_ptr<Parcel>(new Parcel{size, std::move(host), std::move(device), std::move(arrived)});
 }

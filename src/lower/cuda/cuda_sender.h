@@ -13,8 +13,8 @@ namespace vla::lower {
 
 class CudaSent;
 
-/// Sends bytes to a device while it computes, over a separate stream and to memory beside the slots, which the previous
-/// act may still read. Safe for any thread.
+/// Sends bytes to a device while it computes, over a separate stream. The bytes go to memory of their own, because the
+/// previous act may still read the slots. Safe for any thread.
 class CudaSender : public std::enable_shared_from_this<CudaSender> {
  public:
   /// Errors: device.
@@ -26,7 +26,7 @@ class CudaSender : public std::enable_shared_from_this<CudaSender> {
 
  private:
   friend class CudaSent;
-  /// Page-locked host memory, as much device memory, and the event of the copy between them.
+  /// Page-locked host memory, device memory of the same size, and the event recorded after the copy.
   struct Parcel {
     std::size_t size;
     cuda::Owned host;
@@ -41,16 +41,16 @@ class CudaSender : public std::enable_shared_from_this<CudaSender> {
   std::shared_ptr<cuda::Gpu> gpu_;
   cuda::Stream stream_;
   std::mutex mutex_;
-  std::vector<std::unique_ptr<Parcel>> idle_;  // as many as were ever in transit at once
+  std::vector<std::unique_ptr<Parcel>> idle_;  // parcels for reuse
   std::size_t n_made_ = 0;
 };
 
-/// A sent parcel, or why it was not sent.
+/// A sent parcel, or the error that prevented it.
 class CudaSent final : public Device::Sent {
  public:
   ~CudaSent() override;
   Status status() const { return parcel_ ? Status() : parcel_.error(); }
-  // Where it was:
+  // Only if the parcel was sent:
   cuda::Address address() const { return (*parcel_)->device.address(); }
   const cuda::Owned& arrived() const { return (*parcel_)->arrived; }
 

@@ -42,7 +42,7 @@ void pack_codes(const kernels::MatrixDesc& desc, const std::byte* stored, std::b
   cuda::pack_int8(kKind, stored, desc.d_in, desc.d_out, packed);
 }
 
-/// By MatrixKind.
+/// Indexed by MatrixKind.
 constexpr Packing kPacking[] = {{f32_size, pack_f32},
                                 {bf16_size, pack_bf16},
                                 {code_size<cuda::CodeKind::ternary>, pack_codes<cuda::CodeKind::ternary>},
@@ -127,7 +127,7 @@ Status CudaWeights::give_places(const ParamList& list, const WeightPlan& plan, C
   return {};
 }
 
-/// Reads what is resident.
+/// Reads, packs and uploads the resident parameters.
 Status CudaWeights::fill(const ParamList& list, CudaQueue& queue) const {
   const Content& content = *list.bundle()->content();
   Packer packer;

@@ -16,13 +16,13 @@ namespace vla::lower {
 /// int8 codes.
 enum class MatrixKind { f32, bf16, ternary, int4, int8 };
 constexpr bool is_of_codes(MatrixKind kind) { return kind >= MatrixKind::ternary; }
-/// Of a matrix of codes.
+/// The code kind of a matrix of codes.
 constexpr cuda::CodeKind code_kind(MatrixKind kind) {
   return static_cast<cuda::CodeKind>(static_cast<int>(kind) - static_cast<int>(MatrixKind::ternary));
 }
 static_assert(code_kind(MatrixKind::int8) == cuda::CodeKind::int8);
 
-/// What the names of its kernels begin with: `linear_bf16`.
+/// The prefix of the kernels' names, such as `linear_bf16`.
 std::string kernel_name(MatrixKind kind);
 
 /// A parameter's address and layout on the device: vectors and float32 matrices as float32, tables as stored, other
@@ -38,9 +38,10 @@ constexpr std::int64_t bf16_stride(std::int64_t n) { return cuda::round_up(n, 8)
 
 class CudaWeights {
  public:
-  /// Loads the parameters. Matrices stored as bf16 are multiplied as bf16. at_load bf16, int8 or int4 converts large
-  /// float matrices to it; float32 converts all but ternary ones to float32. fill: whether to read the file. plan: the
-  /// matrices that are streamed from it in every act. Errors: out_of_memory, bad_bundle, device.
+  /// Loads the parameters. Matrices stored as bf16 are multiplied as bf16. rounding: bf16, int8 or int4 converts large
+  /// float matrices to that type; float32 converts all but ternary matrices to float32. fill: whether to read the file.
+  /// plan: the matrices that are streamed from the file in every act. Errors: out_of_memory, bad_bundle, device,
+  /// unsupported if no matrix would get the requested type.
   static Result<CudaWeights> load(const ParamList& list, Rounding rounding, bool fill, const WeightPlan& plan,
                                   const std::shared_ptr<CudaQueue>& queue);
 

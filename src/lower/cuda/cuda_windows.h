@@ -10,7 +10,7 @@
 namespace vla::lower {
 
 /// Copies groups of matrices into windows of device memory over a separate stream, while kernels read other windows.
-/// The host's windows are page-locked, so that the device reads them itself.
+/// The host's windows are page-locked, so that the device reads them directly.
 class CudaWindows final : public WindowMemory {
  public:
   /// device: address of the first window; each has `size` bytes. Errors: device, out_of_memory.
@@ -26,7 +26,7 @@ class CudaWindows final : public WindowMemory {
   CudaWindows(std::shared_ptr<CudaQueue> queue, cuda::Stream copies, cuda::Address device, std::size_t size)
       : queue_(std::move(queue)), copies_(std::move(copies)), device_(device), size_(size) {}
   std::size_t offset(int window) const { return static_cast<std::size_t>(window) * size_; }
-  /// Recorded after the kernels that read a window so far.
+  /// The event recorded after the kernels that have read a window so far.
   const cuda::Owned& read(int window) const { return read_[static_cast<std::size_t>(window)]; }
   Status copy(int window, std::size_t size);
 

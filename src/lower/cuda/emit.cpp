@@ -32,7 +32,7 @@ Work work_of(const CudaLowering& l, const CudaOp& op) {
   work.flop = std::visit([](const auto& what) { return what.flop(); }, op.op);
   for (const ValueId id : op.reads) work.bytes += size_of(l.value(id));
   for (const ValueId id : op.writes) work.bytes += size_of(l.value(id));
-  if (op.partial != kNone) work.bytes += size_of(l.value(op.partial));  // read as well
+  if (op.partial != kNone) work.bytes += size_of(l.value(op.partial));  // sums are written, then read
   if (const auto* linear = std::get_if<LinearOp>(&op.op))
     for (const Node* node : linear->linears) {
       const MatrixKind kind = l.matrix(*node).kind;
@@ -40,7 +40,7 @@ Work work_of(const CudaLowering& l, const CudaOp& op) {
       work.weights += bits_of(kind) / 8 * static_cast<double>(node->as<op::Linear>()->weight->count());
     }
   if (const auto* lookup = std::get_if<LookupOp>(&op.op); lookup != nullptr && lookup->table != kNone)
-    work.bytes -= size_of(l.value(lookup->table));  // a table: only as many rows as there are results
+    work.bytes -= size_of(l.value(lookup->table));  // a lookup does not read the whole table
   work.bytes += work.weights;
   return work;
 }

@@ -30,10 +30,11 @@ Call call(const cuda::Launch& how, const Job& job) {
 }
 inline int narrow(std::int64_t n) { return static_cast<int>(n); }
 inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]; }
-/// more: "heads of at most".
+/// `more` precedes the limit `most` in the message, such as "heads of at most".
 Error unsupported(const char* what, const char* more, std::int64_t most, std::int64_t found);
 
-/// Launches an element-wise kernel over a shape of up to six dimensions, fastest first; b is optional.
+/// The job of an element-wise kernel over a shape of up to six dimensions, fastest first. The caller sets the operation
+/// and its second operand, if any.
 template <class Extents>
 cuda::MapJob map_job(const Extents& shape, const float* a, const Extents& a_stride, float* y, const Extents& y_stride) {
   cuda::MapJob job = {};

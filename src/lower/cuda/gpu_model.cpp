@@ -11,11 +11,12 @@ namespace {
 
 constexpr double kTera = 1e12, kGiga = 1e9, kMicro = 1e-6;
 
-// Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202, H100 and H200. Two figures are from memory
-// of published reports and were never checked: mma.sync reaches 0.62 of the H100's tensor units; and the time of a
-// launch in a graph, but for Hopper's: of small kernels of acts on an H200, begun before the kernel before them ends.
+// Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202, H100 and H200. Two figures are recalled
+// from published reports and unchecked: mma.sync reaches 0.62 of the peak of the H100's tensor units; and the time of a
+// launch in a graph on GPUs other than Hopper. Hopper's launch time is that of small kernels of acts on an H200, each
+// begun before the previous kernel ends.
 
-/// H100 and H200 differ in their memory alone.
+/// H100 and H200 differ only in their memory.
 constexpr GpuModel hopper(const char* name, const char* description, double bandwidth) {
   return {.name = name,
           .description = description,
@@ -68,9 +69,9 @@ constexpr GpuModel kModels[] = {
     hopper("h200", "H200 SXM 141 GB, 132 SMs at 1.83 GHz", 4800 * kGiga),
 };
 
-// Of other GPUs, assumed and never measured: the fraction of issue slots that a quarter of an SM fills when nothing
-// else stalls it; the cycles of the smallest kernel; the latency of memory; the bytes that an SM reads from the L2
-// cache per cycle.
+// Assumptions for other GPUs, never measured. kSmBytes: bytes that an SM reads from the L2 cache per cycle. kIssue: the
+// fraction of issue slots that a quarter of an SM fills when nothing else stalls it. kKernelCycles: cycles of the
+// smallest kernel. kMemoryLatency: seconds.
 constexpr double kSmBytes = 22;
 constexpr double kIssue = 0.75, kKernelCycles = 4000, kMemoryLatency = 0.8 * kMicro;
 
@@ -79,11 +80,11 @@ constexpr double kIssue = 0.75, kKernelCycles = 4000, kMemoryLatency = 0.8 * kMi
 /// of attention include the mask's branch.
 struct Loop {
   const char* kernel;
-  int instructions, tensor;  // instructions of a warp per step
-  int registers;             // of a thread
+  int instructions, tensor;  // instructions of a warp per step: all, and on tensor cores
+  int registers;             // registers per thread
   int step;                  // elements of the depth, or keys, per step
   int stage, n_stage;        // bytes read per step, and steps that fit in shared memory
-  int n_warp = 4;            // of a block
+  int n_warp = 4;            // warps per block
 };
 constexpr Loop kLoops[] = {
     {"linear_bf16_64", 163, 16, 94, 32, 2 * 64 * 64, 4},
@@ -116,7 +117,7 @@ struct Cost {
   double bytes = 0;
   // seconds to read memory on an otherwise idle GPU, limited by the bytes that its blocks have in flight
   double fetch = 0;
-  int n_launch = 0;  // whose time is not in `alone` yet
+  int n_launch = 0;  // launches whose time is not in `alone`
 };
 
 class Costs {
@@ -135,17 +136,18 @@ class Costs {
   }
 
  private:
-  /// Time of kernels on Hopper as they were measured, from launch to end.
+  /// Adds a time fitted to measurements on Hopper, from launch to end.
   static void add_measured(Cost& cost, double us) {
     cost.products += us * kMicro, cost.alone += us * kMicro;
     cost.n_launch = 0;
   }
-  /// Time of equal blocks on one SM, which runs them one after the other.
+  /// Adds the time of equal blocks; each SM runs its blocks one after the other.
   void add_blocks(Cost& cost, double n_block, double of_block) const {
     cost.products += n_block * of_block / gpu.n_sm;
     cost.alone += std::ceil(n_block / gpu.n_sm) * of_block;
   }
-  /// Time of tensor-core blocks: each quarter of an SM issues its warps' instructions while its tensor unit multiplies.
+  /// Adds the time of tensor-core blocks: each quarter of an SM issues its warps' instructions while its tensor unit
+  /// multiplies.
   void add_loops(Cost& cost, double n_block, double n_step, const Loop& loop, double rate,
                  double of_instruction) const {
     const double tensor_cycles = of_instruction * 4 * gpu.n_sm * gpu.clock / rate;
@@ -169,7 +171,7 @@ class Costs {
         const double padded = tiles * static_cast<double>(size * size) * 2 * static_cast<double>(weight.shape[0]);
         add_blocks(cost, tiles, padded / tiles / (gpu.f32 / gpu.n_sm));
       } else if (gpu.is_hopper && us > 0) {
-        const bool is_one = linear.gated && op.gate == kNone;  // `us` is that of gate and up together
+        const bool is_one = linear.gated && op.gate == kNone;  // `us` is the time of gate and up together
         add_measured(cost, us / (is_one ? 2 : 1));
       } else if (const std::int64_t width = strip_width(shape); width > 0) {
         const std::int64_t n_block = (columns + width - 1) / width * ((rows + 63) / 64) * n_split;

@@ -12,16 +12,17 @@ namespace {
 
 /// Cost model of a product, in microseconds and rates per microsecond.
 struct Rates {
-  double sums;           // results of a block that take a step of the depth
+  double sums;           // results of a block that advance by one step of the depth
   double of_sm;          // bytes that an SM reads from the L2 cache
-  double least;          // least time of a step of the depth
+  double least;          // minimum time of a step of the depth
   double kernel, block;  // fixed costs of the kernel and of a block
-  double first_end;      // once for blocks that end in results: fetching the epilogue's instructions
-  double end, share;     // per result of a block, and per sum of a share of the depth
+  double first_end;      // once for blocks that write results: fetching the epilogue's instructions
+  double end, share;     // per result of a block, and per partial sum of a depth share
   double further;        // the fraction of a block's time that each further block on an SM adds
 };
 // Fitted to measurements on an H200: bf16 to 930 products of 50 to 2048 rows with float32 results, int8 to 194 and
-// ternary to 408; 96, 96 and 89 % are within a sixth. The tile that is chosen takes 1.19 times the best one's at most.
+// ternary to 408; 96, 96 and 89 % of the estimates are within a sixth of the measurement. The chosen tile takes at most
+// 1.19 times as long as the best one.
 constexpr Rates kBf16 = {.sums = 42.7e3,
                          .of_sm = 67.1e3,
                          .least = 0.267,
@@ -49,9 +50,9 @@ constexpr Rates kInt8 = {.sums = 51.6e3,
                          .end = 3.4e-4,
                          .share = 3.5e-5,
                          .further = 1.18};
-constexpr double kWritten = 2.5e6;  // bytes that all SMs write to memory in a microsecond
+constexpr double kWritten = 2.5e6;  // bytes that all SMs together write to memory per microsecond
 
-/// A tile of a table, and the bytes that a step of 128 bytes of the depth reads.
+/// A tile of a table, and the bytes that it reads per step of 128 bytes of depth.
 struct Candidate {
   std::size_t index;
   std::int64_t columns, rows, step_bytes;
@@ -87,7 +88,8 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
   ProductCut best = {ProductShape::hopper, 1, 0, std::numeric_limits<double>::max()};
   for (const Candidate& tile : candidates(kind, what))
     for (const int n_split : {1, 2, 3, 4, 6, 8}) {
-      // As far as was measured: shares of codes down to a step, but then four at most, and no more than SMs may need.
+      // The measured range: a share has at least 4 steps, or for codes 1 step with up to 4 shares. Products of codes
+      // are not split further than about twice the SMs can use.
       const std::int64_t n_whole = ceil_of(n_row, tile.rows) * ceil_of(n_column, tile.columns);
       if (n_split > 1 && n_step / n_split < (is_bf16 || n_split > 4 ? 4 : 1)) break;
       if (!is_bf16 && n_whole * (n_split - 1) > 2 * n_sm) break;

@@ -14,8 +14,8 @@
 namespace vla::lower {
 namespace {
 
-/// Whether a bf16 product of this many rows uses strips. With more rows, tiles of both operands in shared memory pay
-/// for their barriers.
+/// Whether a bf16 product of this many rows uses strips. With more rows, tiles of both operands in shared memory are
+/// faster despite their barriers.
 bool is_of_strips(std::int64_t n_row, std::int64_t depth) {
   return n_row > cuda::kBf16FewRows && n_row <= 64 && depth % 8 == 0;
 }
@@ -58,7 +58,7 @@ class CudaLayouts final : Layouts {
     prepare(step, v, rounds);
     keys_[step.writes[0]] = {op.k.x, v.x};
   }
-  /// Adds an operation that norms and rotates x before the current one; returns x itself if there is neither.
+  /// Makes `rows` read normed, rotated or rounded heads: adds an operation for that before the current one, if needed.
   void prepare(Step& step, HeadRows& rows, bool rounds) {
     meet(step, rows.operands());
     if (rows.norm == nullptr && rows.rope == nullptr && !rounds) return;
@@ -66,7 +66,7 @@ class CudaLayouts final : Layouts {
     l.ops.push_back({{.reads = step.reads, .writes = {to}, .order = step.order}, HeadOp{rows}});
     rows.x = to, rows.norm = rows.rope = nullptr;
   }
-  /// bf16 kernels read heads in whole 16 bytes.
+  /// bf16 kernels read heads in units of 16 bytes.
   bool rounds_heads(bool rounds, const HeadRows& rows) const { return rounds && l.value(rows.x).shape[0] % 8 == 0; }
 
   void choose(Step& step, LinearOp& op) {
@@ -86,7 +86,7 @@ class CudaLayouts final : Layouts {
     CudaOp& made = l.ops.emplace_back(CudaOp{std::move(step), std::move(op), cut});
     if (has_gate) made.writes.push_back(made.gate = add_rows(y));
   }
-  /// Sums of a share of the depth.
+  /// The number of sums in one share of the depth.
   static std::int64_t n_sum(const CudaOp& op, const LinearOp& product) {
     return count(product.linears[0]->shape) * (product.gated && op.gate == kNone ? 2 : 1);
   }
@@ -96,8 +96,8 @@ class CudaLayouts final : Layouts {
     return product != nullptr && product->linears.size() == 1 && op.reads.size() == 1 &&
            l.matrix(*product->linears[0]).kind == MatrixKind::bf16 && op.cut.shape != ProductShape::few;
   }
-  /// Cuts the first plain product of an x and the next ones of it, as q, k and v, alike, so that merge_calls makes one
-  /// launch of them.
+  /// Gives the plain products of one x, such as q, k and v, the same cut, so that merge_calls makes one launch of them.
+  /// Does nothing if separate launches are faster, or if `first` is not the first product of its x.
   void cut_together(std::size_t first) {
     std::vector<std::size_t> all;
     for (std::size_t i = 0; i < l.ops.size() && all.size() < cuda::kMostJobs; ++i)
@@ -127,11 +127,11 @@ class CudaLayouts final : Layouts {
              (is_of_strips(n_row, l.value(op.x).shape[0]) || (l.is_hopper && n_row > 64));
     });
   }
-  /// n: floats of each share's partial result.
+  /// Adds the value for partial results if there are several shares. n: floats per share.
   void split(CudaOp& op, int n_split, std::int64_t n) {
     if (n_split > 1) op.writes.push_back(op.partial = add_rows({n, n_split, 1, 1}));
   }
-  /// Stores the result of a product, attention or window rounded if `reader` is its only reader.
+  /// Stores the result of a product, attention or window rounded if `round` is its only reader.
   void round_at_once(CudaOp& round, const RoundOp& what) {
     const Value &x = l.value(what.x), &to = l.value(round.writes[0]);
     const bool is_whole =
@@ -165,8 +165,8 @@ class CudaLayouts final : Layouts {
     l.value(to).base = maker->writes[0];
     head.writes.clear();
   }
-  /// Has the norm of a product's result add the product's shares of the depth, if it is the first that reads it: one
-  /// kernel less in a layer's chain.
+  /// Lets a norm add the depth shares of the product that it reads, if no other operation reads the product's result
+  /// before. This shortens a layer's chain by one kernel.
   void finish_in_norm(CudaOp& norm, const RoundOp& what) {
     const Value& x = l.value(what.x);
     const bool is_whole = x.base == what.x && x.placement == Value::Placement::arena && !is_tapped(what.x);
@@ -187,8 +187,8 @@ class CudaLayouts final : Layouts {
       if (id != kNone) norm.reads.push_back(id);
     norm.writes.push_back(what.x);
   }
-  /// Whether an operation is a product of one bf16 matrix in shares of the depth, without what cuda::FinishNormJob
-  /// lacks.
+  /// Whether an operation is a product of one bf16 matrix with split depth whose shares cuda::FinishNormJob can add: it
+  /// supports no activation and no final ReLU.
   bool leaves_plain_shares(const CudaOp& op) const {
     const auto* product = std::get_if<LinearOp>(&op.op);
     return product != nullptr && product->linears.size() == 1 && op.partial != kNone && !leaves_shares(op) &&
@@ -217,20 +217,20 @@ class CudaLayouts final : Layouts {
 
   CudaLowering& l;
   std::map<ValueId, std::pair<ValueId, ValueId>> keys_;
-  std::map<ValueId, int> n_reader_;  // of each base and its views
+  std::map<ValueId, int> n_reader_;  // readers of each base and its views
 };
 
 std::int64_t blocks_of(std::int64_t n_row, std::int64_t n_column, std::int64_t rows, std::int64_t columns) {
   return (n_row + rows - 1) / rows * ((n_column + columns - 1) / columns);
 }
 
-/// Microseconds of a strip kernel, measured on an H200: a warp waits in each step of the depth; a kernel that adds
-/// shares takes 2 us and the traffic of its sums.
+/// Estimated microseconds of a strip kernel, from measurements on an H200: a warp takes a fixed time per step of the
+/// depth; the kernel that adds shares takes 2 us plus the traffic of its sums.
 double strip_us(std::int64_t width, int n_split, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
                 int n_sm) {
   constexpr double kBegin = 2, kOfAll = 2.5e6, kFinish = 2;
   const std::int64_t n_block = blocks_of(n_row, n_column, 64, width) * n_split;
-  const std::int64_t n_warp = width <= 32 ? 8 : 256 / width;  // that share the depth
+  const std::int64_t n_warp = width <= 32 ? 8 : 256 / width;  // warps that share the depth
   const std::int64_t of_warp =
       (depth + cuda::kBf16Depth * n_warp * n_split - 1) / (cuda::kBf16Depth * n_warp * n_split);
   const double of_step = width == 16 ? 0.85 : 1.4;
@@ -262,13 +262,14 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
                        std::int64_t depth, bool is_gated) {
   const int n_sm = l.n_sm;
   const bool is_bf16 = kind == MatrixKind::bf16, is_few = n_row <= (is_bf16 ? cuda::kBf16FewRows : 4);
-  // No tile for Hopper expands int4's codes.
+  // No Hopper tile expands int4 codes.
   const bool has_tiles = l.is_hopper && kind != MatrixKind::f32 && kind != MatrixKind::int4 && !is_few;
   const HopperCutFor tables = is_gated ? HopperCutFor::gated : HopperCutFor::one;
   if (is_bf16 && is_of_strips(n_row, depth)) {
     const ProductCut strips = cut_in_strips(n_row, n_column, depth, n_sm);
     if (!has_tiles) return strips;
-    // Measured: tiles of few rows and the kernel that adds their shares take so many microseconds beyond the estimate.
+    // Measured: tiles of few rows, with the kernel that adds their shares, take this many microseconds more than
+    // estimated.
     constexpr double kMore = 1.5;
     const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
     return tiles.us + kMore < strips.us ? tiles : strips;
@@ -281,8 +282,9 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
   if (kind == MatrixKind::f32) return {shape, 1};
   std::int64_t n_block = shape == ProductShape::rows128 ? n_large : blocks_of(n_row, n_column, 64, 64);
   if (is_few) n_block = blocks_of(1, n_column, 1, is_bf16 ? 8 : 128);
-  // A share has a few steps or more; the depth is split only if there are fewer blocks than run at a time. A step of
-  // codes has twice the depth, and the kernel that ends many shares is faster than the end of a few blocks.
+  // A share has at least `least` steps. The depth is split only if there are fewer blocks than SMs. Codes allow fewer
+  // steps per share: their steps are twice as deep, and one kernel that adds many shares is faster than the epilogues
+  // of a few blocks.
   const std::int64_t step = is_bf16 ? cuda::kBf16Depth : cuda::Int8Tile::kDepth, least = is_bf16 ? 8 : 3;
   const std::int64_t most = std::max<std::int64_t>((depth + step - 1) / step / least, 1);
   return {shape, static_cast<int>(std::clamp<std::int64_t>(n_sm / std::max<std::int64_t>(n_block, 1), 1, most))};

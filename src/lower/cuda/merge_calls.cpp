@@ -32,7 +32,8 @@ bool is_strip(const Calls& calls) {
   return job.n_split == 1 && job.gate_weight == nullptr;
 }
 bool is_heads(const Calls& calls) { return calls.size() == 1 && calls[0].how.kernel == std::string_view("head_rows"); }
-/// The Hopper tile of a bf16 product that leaves no shares to another operation, if it has a kernel of several.
+/// The Hopper tile of a bf16 product, if a kernel computes several products with this tile and no other operation adds
+/// the product's shares; else null.
 const cuda::HopperTile* tile_of(const Calls& calls) {
   const auto* tile = std::find_if(std::begin(cuda::kHopperTiles), std::end(cuda::kHopperTiles),
                                   [&](const auto& one) { return calls[0].how.kernel == std::string_view(one.kernel); });
@@ -40,8 +41,8 @@ const cuda::HopperTile* tile_of(const Calls& calls) {
   return (job_of<cuda::LinearBf16Job>(calls[0]).n_split > 1) == (calls.size() == 2) ? tile : nullptr;
 }
 
-/// Merges operations for which `fits` holds and `agrees` with the first, up to kMostJobs at a time. `merged` makes the
-/// calls of several, of which it fills in where each job ends.
+/// Merges operations for which `fits` holds and that agree with the first one (`agrees`), up to kMostJobs at a time.
+/// `merged` makes the calls of the merged jobs and fills in where each job ends.
 template <class Job, class Fits, class Agrees, class Merged>
 void merge(std::vector<Calls>& phase, Fits fits, Agrees agrees, Merged merged) {
   for (std::size_t first = 0; first < phase.size(); ++first) {

@@ -6,8 +6,8 @@
 
 namespace vla::lower {
 
-/// Merges independent operations of a phase into one kernel: strips and Hopper's tiles of products with the same rows,
-/// depth and shares of it, and rows of heads, as of q, k and v. n_sm: blocks that run at a time.
+/// Merges independent operations of a phase, such as those of q, k and v, into one kernel: products in strips or Hopper
+/// tiles with equal rows, depth and shares, and operations on rows of heads. n_sm: SMs of the device.
 void merge_calls(std::vector<Calls>& phase, int n_sm);
 
 }  // namespace vla::lower

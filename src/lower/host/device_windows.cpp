@@ -9,7 +9,7 @@
 namespace vla::lower {
 namespace {
 
-/// Threads that read streamed matrices. A GPU leaves the cores idle, and four threads outrun most disks.
+/// Number of threads that read streamed matrices. A GPU leaves the cores idle, and four threads outrun most disks.
 int n_reader() { return std::clamp(static_cast<int>(kernels::allowed_cores().size()) / 2, 1, 4); }
 
 }  // namespace

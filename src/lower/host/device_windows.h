@@ -33,8 +33,8 @@ class DeviceWindows {
                                                       const std::function<MatrixPlace(const Param&)>& place_of,
                                                       const std::function<std::size_t(const Param&)>& size_of);
 
-  /// Puts groups on the device for the work queued next; they stay until others are requested. Errors: bad_bundle if
-  /// the file no longer has their bytes, device.
+  /// Puts groups on the device for the work queued next; they stay until other groups are requested. Errors: bad_bundle
+  /// if the file no longer has their bytes, device.
   Status bring(const Groups& groups);
 
  private:
@@ -44,9 +44,9 @@ class DeviceWindows {
   Status upload(int group);
 
   std::unique_ptr<WindowMemory> memory_;
-  std::vector<std::size_t> sizes_;                // of groups
+  std::vector<std::size_t> sizes_;                // bytes of each group
   std::array<int, WeightStream::kWindows> held_;  // the group in each of the device's windows, or -1
-  Groups reading_;                                // of the last request
+  Groups reading_;                                // groups of the last request
   std::unique_ptr<WeightStream> stream_;          // destroyed before the memory that it writes to
 };
 

@@ -20,7 +20,7 @@ class Memory {
   Memory() = default;
   /// `what` names the memory in the error. Errors: out_of_memory.
   static Result<Memory> allocate(std::size_t size, const std::string& what);
-  /// Reserves addresses that read as zeros, may not be written and take no memory, even more than the system has.
+  /// Reserves addresses that read as zeros, may not be written and take no memory. May exceed the system's memory.
   static Result<Memory> reserve(std::size_t size, const std::string& what);
 
   std::byte* data() const { return data_.get(); }

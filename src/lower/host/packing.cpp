@@ -15,12 +15,13 @@ constexpr std::int64_t kPartRows = 64;
 /// Minimum bytes of a part.
 constexpr std::int64_t kPartSize = 1 << 20;
 
-/// Size of the matrix as it is multiplied.
+/// The matrix's dtype in memory and its sizes.
 kernels::MatrixDesc desc_of(const Param& matrix, const Encoding& encoding) {
   return {encoding.type, matrix.shape[0], matrix.shape[1]};
 }
 
-/// The bundle's scales from element `first` on, if needed: to make float32, or to store beside the packed matrix.
+/// The bundle's scales for `count` elements from `first` on, if float32 is made from them or they are stored after the
+/// packed matrix; else empty.
 std::span<const std::byte> scales_of(const Param& matrix, const MatrixPlace& place, std::int64_t first,
                                      std::int64_t count) {
   const Encoding& stored = matrix.encoding;

@@ -11,7 +11,7 @@
 
 namespace vla::lower {
 
-/// How a kernel wants matrices: the bytes of one, and a function that packs rows. Rows that start at a multiple of 64
+/// A kernel's matrix format: the bytes of a matrix, and a function that packs rows. Rows that start at a multiple of 64
 /// can be packed independently of the rows before.
 struct Packing {
   std::size_t (*size)(const kernels::MatrixDesc& desc) = nullptr;
@@ -22,15 +22,15 @@ struct Packing {
 struct MatrixPlace {
   Encoding encoding;
   Packing packing;
-  std::int64_t n_scale = 0;  // scales stored after it: the bundle's, or computed from floats
+  std::int64_t n_scale = 0;  // scales stored after the matrix: the bundle's, or computed from floats
   std::byte* data = nullptr;
-  float* scales = nullptr;  // null if it has none
+  float* scales = nullptr;  // null if there are none
 
   /// Bytes of the packed matrix and its scales, both aligned.
   std::size_t size_of(const Param& param) const;
   /// Offset of the scales in bytes.
   std::size_t scales_begin(const Param& param) const;
-  /// Packs the matrix to `to` and writes its scales after it.
+  /// Sets the addresses: the packed matrix at `to`, its scales after it.
   void put(const Param& param, std::byte* to);
 };
 
@@ -48,12 +48,12 @@ struct PackPart {
 /// Cuts a matrix into parts of about one megabyte.
 void add_parts(const Param& matrix, const MatrixPlace& place, std::vector<PackPart>& parts);
 
-/// Buffers of one thread that reads parts; at most one part per thread is in memory twice.
+/// Buffers of one thread that reads parts. Each thread holds at most one part in memory twice.
 class Packer {
  public:
   /// Allocates what these parts need, so that threads never run out of memory. Throws std::bad_alloc.
   void reserve(std::span<const PackPart> parts);
-  /// Returns false if the file no longer has these bytes.
+  /// Reads and packs a part. Returns false if the file no longer has these bytes.
   bool run(const Content& content, const PackPart& part);
 
  private:

@@ -20,7 +20,7 @@ struct Recode {
     return aligned(wanted.size(count)) + static_cast<std::size_t>(row) * sizeof(float);
   }
   /// Converts `count` elements (whole groups) into `buffer`, or returns `from` if both encodings are equal.
-  /// from_scales: scales of codes that become floats. scales: receives those of floats that become codes.
+  /// from_scales: scales of codes that become floats. scales: receives the scales of floats that become codes.
   const std::byte* operator()(const std::byte* from, const float* from_scales, std::int64_t count, ReadBuffer& buffer,
                               float* scales) const;
 };

@@ -9,7 +9,8 @@
 namespace vla::lower {
 namespace {
 
-/// Phases that read groups, joined where those are in memory already, with what lies between.
+/// Returns a segment for each phase that reads groups. If the last segment holds these groups already, extends that
+/// segment instead, with the phases between.
 std::vector<Segment> find_readers(std::span<const Groups> phases, std::size_t begin) {
   std::vector<Segment> readers;
   for (std::size_t i = 0; i < phases.size(); ++i) {
@@ -22,7 +23,7 @@ std::vector<Segment> find_readers(std::span<const Groups> phases, std::size_t be
   return readers;
 }
 
-/// The last group that goes when `now` is done and `then` is next.
+/// The last group to release after a segment that reads `now`, if the next one reads `then`; -1: none.
 int released(const Groups& now, const Groups& then) {
   const bool goes_on = now.first <= then.first && then.first <= now.last;
   if (!goes_on) return now.last;

@@ -10,7 +10,7 @@
 
 namespace vla::lower {
 
-/// Groups of streamed matrices (weight_stream.h) that phases read: from `first` to `last`, or none.
+/// The groups of streamed matrices (weight_stream.h) that phases read: `first` to `last`, or none.
 struct Groups {
   int first = -1, last = -1;
 
@@ -19,18 +19,18 @@ struct Groups {
   void add(int group);
 };
 
-/// Phases from `begin` to before `end`, which run without a stop once their groups are in memory.
+/// The phases [begin, end), which run without a pause once their groups are in memory.
 struct Segment {
   std::size_t begin, end;
   Groups groups = {};
-  int released = -1;  // groups up to this one are needed no more then; -1: none
+  int released = -1;  // groups up to this one are released after the segment; -1: none
 };
 
-/// The groups that each of some phases reads, where a matrix of id i is in groups[i]. Errors: internal where they do
-/// not fit into the windows, which phases that were split (lower/split.cpp) do.
+/// Finds the groups that each phase reads; groups[i] is the group of the matrix with Param::id i, or -1. Errors:
+/// internal if the groups of a phase do not fit into the windows; lower/split.cpp splits phases so that they fit.
 Result<std::vector<Groups>> find_groups(const MatrixReads& phases, const std::vector<int>& groups);
 
-/// Cuts phases, of which the first has the number `begin`, where groups must come and where one is needed no more.
+/// Cuts phases into segments where groups must be loaded or can be released. `begin`: the number of the first phase.
 std::vector<Segment> cut_phases(std::span<const Groups> phases, std::size_t begin);
 
 }  // namespace vla::lower

@@ -21,7 +21,8 @@ class Planner {
     while (!group_phases()) groups_.clear();
   }
 
-  /// The plan that streams least of those that fit.
+  /// The plan that streams the fewest groups and fits into `size` bytes; all groups if none fits. Streams nothing if
+  /// all parameters fit, or if streaming saves no memory.
   WeightPlan plan(std::size_t size) const {
     WeightPlan plan;
     plan.smallest = memory(groups_);
@@ -37,8 +38,8 @@ class Planner {
   }
 
  private:
-  /// Phases that follow each other, as many to a group as the largest of them has room for. Where an operation would
-  /// read several groups, its matrices become resident and the answer is false.
+  /// Groups the matrices of consecutive phases; a group is at most as large as the largest phase. If an operation would
+  /// read several groups, makes its matrices resident and returns false.
   bool group_phases() {
     std::vector<Group> phases;
     std::set<const Param*> seen = resident_;
@@ -72,7 +73,7 @@ class Planner {
     return groups.size() > 1;
   }
 
-  /// n of the groups.
+  /// Picks n groups, evenly spread.
   std::vector<Group> spread(std::size_t n) const {
     std::vector<Group> some;
     for (std::size_t i = 0; i < n; ++i) some.push_back(groups_[i * groups_.size() / n]);
@@ -84,7 +85,7 @@ class Planner {
     for (const Param* matrix : group) bytes += use_.size_of(*matrix);
     return bytes;
   }
-  /// Bytes of all parameters, where these groups are streamed if that saves something.
+  /// Bytes of all parameters if these groups are streamed; at most those without streaming.
   std::size_t memory(const std::vector<Group>& streamed) const {
     std::size_t bytes = use_.size + WeightStream::kWindows * window_;
     for (const Group& group : streamed) bytes -= size(group);

@@ -11,23 +11,23 @@ namespace vla::lower {
 
 /// The matrices that an operation reads.
 using OpMatrices = std::vector<const Param*>;
-/// Those of the operations of each of some phases.
+/// For each phase, the matrices that its operations read.
 using MatrixReads = std::vector<std::vector<OpMatrices>>;
 
-/// What an act reads, and how much of the device's memory that takes.
+/// The matrices that an act reads, and their size in the device's memory.
 struct WeightUse {
-  std::span<const std::vector<OpMatrices>> prepare, prefix, step;  // phases; of the prefix first those that run once
+  std::span<const std::vector<OpMatrices>> prepare, prefix, step;  // by phase; prepare: prefix phases that run once
   std::function<std::size_t(const Param&)> size_of;                // bytes of a matrix
   std::size_t size;                                                // bytes of all parameters
 };
 
-/// Which matrices stay in memory, so that all parameters take at most `size` bytes, or as few as they can: those that
-/// the step reads, since it is run several times an act, and of those that the prefix reads as many as there is room
-/// for. What is streamed lies spread evenly over the prefix, so that it is read while other matrices are multiplied. No
-/// operation of the prefix reads two of the groups, so that none is split and its values take the same memory.
+/// Plans which matrices to stream, so that all parameters take at most `size` bytes, or as few as possible. The step's
+/// matrices stay resident, because the step runs several times per act; as many of the prefix's matrices as fit stay
+/// resident, too. The streamed groups are spread evenly over the prefix, so that they are read while other matrices are
+/// multiplied. No operation of the prefix reads two groups: no operation is split, and values take the same memory.
 WeightPlan plan_streams(const WeightUse& use, std::size_t size);
 
-/// By Param::id, the group of the plan that a matrix is streamed in, or -1.
+/// For each Param::id, the group of the plan that streams the matrix, or -1.
 std::vector<int> groups_by_id(const WeightPlan& plan, std::size_t n_param);
 
 }  // namespace vla::lower

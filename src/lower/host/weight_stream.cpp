@@ -58,7 +58,7 @@ void WeightStream::serve(Packer packer) {
   }
 }
 
-/// Skips empty groups.
+/// Whether a part can be read now. Skips empty groups.
 bool WeightStream::has_part() {
   if (has_failed_ || moves_) return false;
   for (; reading_ < oldest_ + kWindows; ++reading_) {
@@ -89,7 +89,7 @@ void WeightStream::release(int group) {
   go_to(turn_of(group) + 1, lock);
 }
 
-/// The next turn of this group.
+/// The next turn of this group, from `oldest_` on.
 WeightStream::Turn WeightStream::turn_of(int group) const {
   const Turn n = groups_.size();
   return oldest_ + (static_cast<Turn>(group) + n - oldest_ % n) % n;
@@ -101,8 +101,8 @@ bool WeightStream::are_loaded(Turn begin, Turn end) const {
   return true;
 }
 
-/// Frees the windows of all turns before `turn`. If the threads are not there yet, they continue from `turn`; waits
-/// until none writes to a window that is being freed.
+/// Frees the windows of all turns before `turn`. If the threads have not read those turns yet, they continue from
+/// `turn`. Waits until no thread writes to a window that is being freed.
 void WeightStream::go_to(Turn turn, Lock& lock) {
   if (has_failed_ || !are_loaded(oldest_, turn)) {
     moves_ = true;

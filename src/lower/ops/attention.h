@@ -34,9 +34,9 @@ struct PackOp {
 struct AttentionOp {
   const Node* node;
   HeadRows q;
-  bool rounds;  // to the type in which the device computes products; else float32
+  bool rounds;  // computes in the dtype of the device's products; else in float32
   ValueId mask = kNone;
-  // For each segment: the result of PackOp, or keys and values by turns if the target packs none.
+  // For each segment the result of PackOp. If the target does not pack: each segment's keys, then its values.
   std::vector<ValueId> packed = {};
   std::vector<std::int64_t> n_key = {};
 

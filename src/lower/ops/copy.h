@@ -6,11 +6,11 @@
 
 namespace vla::lower {
 
-/// Copies parts of the result from elsewhere: concat, pixel_shuffle, patches, and views that must be contiguous.
+/// Copies parts of the result from other values: concat, pixel_shuffle, patches, and views that must be contiguous.
 struct CopyOp {
   using Extents = std::array<std::int64_t, 6>;  // sizes or strides, fastest first
   struct Part {
-    /// All elements of a shape.
+    /// Copies all elements of a shape.
     Part(ValueId id, const Shape& size, const Shape& step, const Shape& to_step) : from(id) {
       shape.fill(1);
       std::copy(size.begin(), size.end(), shape.begin());

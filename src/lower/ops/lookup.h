@@ -6,7 +6,7 @@
 
 namespace vla::lower {
 
-/// embedding, gather
+/// The operations embedding and gather.
 struct LookupOp {
   const Node* node;
   ValueId ids, table = kNone;  // kNone: the table is the embedding's parameter

@@ -6,13 +6,13 @@
 
 namespace vla::lower {
 
-/// Converts x, or its norm, to what products read: codes, bf16 or float32. Once for all products of one x.
+/// Converts x, or its norm, to the type that products read (codes, bf16 or float32), once for all products of one x.
 struct RoundOp {
   const Node* product;  // the first product that reads it
   ValueId x;
   const Node* norm;  // the norm that is applied to x first, or null
   ValueId weight, bias;
-  const char* verb;  // in a printed program
+  const char* verb;  // the operation's name in a printed program
 
   Operands operands() { return {{x, Needs::even_rows}, {weight, Needs::contiguous}, {bias, Needs::contiguous}}; }
   std::string text() const { return std::string(norm != nullptr ? "norm, " : "") + verb; }

@@ -9,12 +9,12 @@
 
 namespace vla::lower {
 
-/// One row at a time.
+/// An operation on one row at a time.
 struct RowOp {
   const Node* node;
   std::variant<op::Norm, op::Rope, op::Activate, op::Add, op::Multiply, op::Scale> what;
   ValueId x, w = kNone, b = kNone;
-  Needs norm_needs;  // of x
+  Needs norm_needs;  // the need of x, if this is a norm
 
   Operands operands() {
     const bool is_norm = std::holds_alternative<op::Norm>(what), is_rope = std::holds_alternative<op::Rope>(what);

@@ -6,7 +6,7 @@
 
 namespace vla::lower {
 
-/// unfold, max_pool, depthwise
+/// The operations unfold, max_pool and depthwise.
 struct WindowOp {
   const Node* node;
   op::Window window;

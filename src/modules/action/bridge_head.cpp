@@ -9,7 +9,7 @@
 namespace vla {
 namespace {
 
-constexpr float kBase = 10000;  // of the rotary embedding
+constexpr float kBase = 10000;  // base of the rotary embedding
 
 }  // namespace
 
@@ -69,7 +69,7 @@ BridgeHead::BridgeHead(const Scope& s, int d_model, int n_layer, int d_action, i
 }
 
 void BridgeHead::constants(Graph& g, Cache& cache) const {
-  // The reference's rows are zeros in front of the first norm.
+  // The reference's rows are zeros before the first norm.
   const Tensor rows = in_(g, in_norm_(g, full(g, 0, d_in_, horizon_)));
   cache.put(g, start_path_, activate(g, rows, Activation::relu));
   for (const BridgeBlock& block : blocks_) block.constants(g, cache);

@@ -10,13 +10,13 @@
 
 namespace vla {
 
-/// How a bridge attention makes keys and values: by one projection of all it sees, or by one for each kind, with rotary
-/// embeddings of queries and keys. Source: VLA-Adapter prismatic/models/action_heads.py MLPResNetBlock,
-/// MLPResNetBlock_Pro.
+/// The projections of a bridge attention to keys and values. original: one projection for all inputs. pro: one for each
+/// kind of input, and rotary embeddings of queries and keys. Source: VLA-Adapter prismatic/models/action_heads.py
+/// MLPResNetBlock, MLPResNetBlock_Pro.
 enum class BridgeVersion { original, pro };
 
-/// One layer over the rows of a chunk: attention to the rows themselves, to features of actions, and to features of the
-/// task, whose scores are multiplied by a gate; then relu(linear(norm(attention + x))).
+/// One layer over the rows of a chunk. The rows attend to themselves, to action features and to task features; a gate
+/// multiplies the scores of the task features. Then relu(linear(norm(attention + x))).
 class BridgeBlock : public Module<BridgeBlock> {
  public:
   BridgeBlock(const Scope& s, int d_model, int n_head, BridgeVersion version, float eps);
@@ -33,24 +33,24 @@ class BridgeBlock : public Module<BridgeBlock> {
   BridgeVersion version_;
   Linear q_;
   KeyValueProjection rows_;
-  std::optional<KeyValueProjection> actions_, task_;  // of `pro`; otherwise `rows_`
+  std::optional<KeyValueProjection> actions_, task_;  // only in `pro`; `original` uses `rows_`
   const Param* gate_;
   Linear out_;
   LayerNorm norm_;
   Linear linear_;
 };
 
-/// VLA-Adapter's head: blocks over the rows of a chunk, which start equal, each with the features of one layer of a
-/// language model. Source: VLA-Adapter prismatic/models/action_heads.py L1RegressionActionHead, MLPResNet.
+/// VLA-Adapter's head: blocks over the rows of a chunk. Each block attends to the features of one layer of a language
+/// model. All rows start equal. Source: VLA-Adapter prismatic/models/action_heads.py L1RegressionActionHead, MLPResNet.
 class BridgeHead {
  public:
   BridgeHead(const Scope& s, int d_model, int n_layer, int d_action, int horizon);
-  /// Load rate: what the rows start from, and the gates.
+  /// Load rate: the rows before the first block, and the gates.
   void constants(Graph& g, Cache& cache) const;
-  /// The rows in front of the first block: [d_model, horizon].
+  /// The rows before the first block: [d_model, horizon].
   Tensor start(Graph& g, const Cache& cache) const { return cache.get(g, start_path_); }
   const BridgeBlock& block(int i) const { return blocks_[static_cast<std::size_t>(i)]; }
-  /// The rows behind the last block -> [d_action, horizon].
+  /// Projects the rows after the last block: [d_model, horizon] -> [d_action, horizon].
   Tensor end(Graph& g, Tensor x) const { return out_(g, out_norm_(g, x)); }
 
  private:

@@ -18,7 +18,7 @@ namespace vla {
 class CrossBlock : public Module<CrossBlock> {
  public:
   CrossBlock(const Scope& s, int d_model, int d_ff, int n_head, float eps);
-  /// Makes keys and values of a context [d_model, n], which is not normalized.
+  /// Projects a context [d_model, n], without normalizing it, to keys and values.
   const KeyValueProjection& project() const { return attention_.project(); }
   /// x [d_model, n], time [d_model, 1], mask [n_key, n] or none -> the shape of x.
   Tensor forward(Graph& g, Tensor x, Tensor time, const KeyValue& seen, Tensor mask) const;

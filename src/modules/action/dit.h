@@ -17,7 +17,7 @@ class DitBlock : public Module<DitBlock> {
  public:
   /// `d_context`: width of the rows that keys and values are projected from.
   DitBlock(const Scope& s, int d_model, int d_context, int n_head, int d_ff, float eps);
-  /// Makes keys and values of a context [d_context, n], which is not normalized.
+  /// Projects a context [d_context, n], without normalizing it, to keys and values.
   const KeyValueProjection& project() const { return attention_.project(); }
   /// x [d_model, n], modulation [2 d_model, 1] -> the shape of x. If `seen` is empty, the tokens attend to each other.
   Tensor forward(Graph& g, Tensor x, Tensor modulation, const std::optional<KeyValue>& seen) const;
@@ -31,7 +31,7 @@ class DitBlock : public Module<DitBlock> {
   Mlp mlp_;
 };
 
-/// A diffusion transformer. Even layers attend to a context, odd layers to their own tokens. In an alternating one the
+/// A diffusion transformer. Even layers attend to a context, odd layers to their own tokens. In an alternating Dit the
 /// even layers take turns between the text and the images of the context. Source: the same file, DiT and
 /// AlternateVLDiT.
 class Dit {
@@ -44,7 +44,8 @@ class Dit {
   /// Observation rate: caches keys and values of the rows that each even layer attends to, [d_context, n] each. If
   /// layers do not alternate, `text` is the whole context.
   void prepare(Graph& g, Tensor text, Tensor image, Cache& cache) const;
-  /// Step rate: x [d_model, n] -> [d_out, n]. `modulations` starts with one column of `condition`.
+  /// Step rate: x [d_model, n] -> [d_out, n]. `modulations`: one column of the function `modulations`; elements after
+  /// it are ignored.
   Tensor operator()(Graph& g, Tensor x, Tensor modulations, const Cache& cache) const;
 
   int d_model() const { return d_model_; }

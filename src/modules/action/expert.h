@@ -14,7 +14,7 @@ namespace vla {
 class ExpertSelfBlock : public Module<ExpertSelfBlock> {
  public:
   ExpertSelfBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
-  /// x [d_model, horizon] -> the same shape; `prefix` is the cached layer of the language model.
+  /// x [d_model, horizon] -> the same shape; `prefix`: keys and values of the language model's layer.
   Tensor forward(Graph& g, Tensor x, const KeyValue& prefix) const;
 
  private:
@@ -29,7 +29,7 @@ class ExpertSelfBlock : public Module<ExpertSelfBlock> {
 class ExpertCrossBlock : public Module<ExpertCrossBlock> {
  public:
   ExpertCrossBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
-  /// Observation rate: projects the cached layer of the language model into the cache.
+  /// Observation rate: projects keys and values of the language model's layer and caches the result.
   void prepare(Graph& g, const KeyValue& prefix, Cache& cache) const;
   /// Step rate. x [d_model, horizon] -> the same shape.
   Tensor forward(Graph& g, Tensor x, const Cache& cache) const;
@@ -42,13 +42,13 @@ class ExpertCrossBlock : public Module<ExpertCrossBlock> {
 };
 
 /// SmolVLA's action expert: a narrower decoder whose layer i attends to the cached layer i of the language model.
-/// `<path>.layer_kinds` says for each of these layers whether the expert's is self-attention, cross-attention or
-/// missing. Source: lerobot policies/smolvla/smolvlm_with_expert.py.
+/// `<path>.layer_kinds` states for each of the language model's layers whether the expert's layer has self-attention or
+/// cross-attention, or does not exist. Source: lerobot policies/smolvla/smolvlm_with_expert.py.
 class Expert {
  public:
   Expert(const Scope& s, const Decoder& lm);
 
-  /// Observation rate: computes what depends on the prefix only.
+  /// Observation rate: computes the values that depend only on the prefix.
   void prepare(Graph& g, Cache& cache) const;
   /// Step rate. x [d_model, horizon] -> the same shape, after the final norm.
   Tensor operator()(Graph& g, Tensor x, const Cache& cache) const;

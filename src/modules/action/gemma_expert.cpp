@@ -94,7 +94,7 @@ Tensor GemmaExpert::part(Graph& g, Tensor modulations, std::size_t i_norm) const
 }
 
 void GemmaExpert::prefill(Graph& g, Tensor x, Cache& cache) const {
-  // Only the last layer's keys and values are read, so the graph does not compute the rest of it.
+  // Of the last layer only keys and values are read, so the graph does not compute the rest of that layer.
   for (std::size_t i = 0; i < blocks_.size(); ++i) x = blocks_[i].prefill(g, x, past(g, cache, i), cache);
 }
 

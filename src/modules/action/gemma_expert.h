@@ -12,7 +12,7 @@
 
 namespace vla {
 
-/// Where the expert's norms get their factors: from weights (π0) or from the time (π0.5).
+/// The source of the factors of the expert's norms: weights (π0) or the time (π0.5).
 enum class ExpertNorm { weighted, adaptive };
 
 /// One norm of the expert, of either kind. Source: lerobot policies/pi_gemma.py PiGemmaRMSNorm.
@@ -26,7 +26,7 @@ class TimedNorm {
   };
   /// x [d, n], modulation [3 d, 1] or none.
   Result operator()(Graph& g, Tensor x, Tensor modulation) const;
-  /// Load rate, of adaptive norms: [d, n_time] -> [3 d, n_time].
+  /// Load rate, for adaptive norms: [d, n_time] -> [3 d, n_time].
   Tensor modulation(Graph& g, Tensor time) const { return std::get<AdaRmsNorm>(norm_).modulation(g, time); }
 
  private:
@@ -43,7 +43,8 @@ class GemmaExpertBlock : public Module<GemmaExpertBlock> {
   };
   /// x [d_model, n] -> the same shape; `past` holds the tokens before it.
   Tensor forward(Graph& g, Tensor x, const KeyValue& past, const Modulations& modulations) const;
-  /// The same for tokens that join the past: caches the past's keys and values followed by theirs. Takes no modulation.
+  /// The same for tokens that extend the past: caches the past's keys and values followed by those of x. Takes no
+  /// modulation.
   Tensor prefill(Graph& g, Tensor x, const KeyValue& past, Cache& cache) const;
 
   const TimedNorm& attn_norm() const { return attn_norm_; }

@@ -13,22 +13,22 @@
 
 namespace vla {
 
-/// What differs between the heads of the releases.
+/// The options in which the heads of the GR00T releases differ.
 struct GrootFamily {
-  bool state_rows;     // the state has `policy.n_state_row` rows, one per moment; each becomes a token
-  bool future_tokens;  // `policy.n_future` learned tokens between the state and the actions
-  bool mixing;         // `vl.n_layer` layers of self-attention over the context
-  bool alternating;    // even layers attend to text or images in turn (`dit.attend_text_every_n_blocks`), else to both
-                       // rows
-  bool norm = true;    // `context` normalizes and mixes the features, else it returns them
+  bool state_rows;              // the state has `policy.n_state_row` rows, one per moment; each becomes a token
+  bool future_tokens;           // `policy.n_future` learned tokens between the state and the actions
+  bool mixing;                  // `vl.n_layer` layers of self-attention over the context
+  bool alternating;             // even layers alternate between text and images (`dit.attend_text_every_n_blocks`);
+                                // otherwise they attend to both
+  bool norm = true;             // features pass `vl.norm`; without it, do not call `context`
   bool may_lack_state = false;  // `policy.d_state` may be 0: then there is no state token
 };
 
 /// The action head of GR00T: self-attention over the features, a diffusion transformer over tokens of state and
-/// actions, and around it layers that each robot has of its own. Flow matching from noise (t = 0) to actions (t = 1).
-/// Reads `vl.*`, `dit.*` and `policy.*`. Source: lerobot policies/groot/groot_n1_7.py GR00TN17ActionHead; before it
-/// Isaac-GR00T gr00t/model/action_head/flow_matching_action_head.py (future tokens). VLA-JEPA's is the same, for one
-/// robot: lerobot policies/vla_jepa/action_head.py VLAJEPAActionHead.
+/// actions, and before and after it layers with weights of each robot's own. Flow matching from noise (t = 0) to
+/// actions (t = 1). Reads `vl.*`, `dit.*` and `policy.*`. Source: lerobot policies/groot/groot_n1_7.py
+/// GR00TN17ActionHead; before it Isaac-GR00T gr00t/model/action_head/flow_matching_action_head.py (future tokens).
+/// VLA-JEPA's is the same, for one robot: lerobot policies/vla_jepa/action_head.py VLAJEPAActionHead.
 class GrootHead {
  public:
   /// `s` is the root of the tree; `d_context`: width of the features.
@@ -38,7 +38,7 @@ class GrootHead {
   Tensor condition(Graph& g, std::span<const SolverTime> times) const;
   /// Observation rate: features [d_context, n] -> the same shape, normalized and mixed.
   Tensor context(Graph& g, Tensor features) const;
-  /// Observation rate: caches keys and values of the context, and the tokens before those of the actions.
+  /// Observation rate: caches keys and values of the context, and the tokens before the action tokens.
   void prepare(Graph& g, Tensor text, Tensor image, Tensor state, Cache& cache) const;
   /// Step rate: x_t [d_action, horizon] -> the velocity, the same shape. `condition` is one column of the load rate's
   /// table.

@@ -10,7 +10,7 @@ namespace vla {
 namespace {
 
 constexpr int kMaxLevels = 12, kMaxKernel = 255, kMaxWidth = 16384;
-constexpr int kOutGroups = 8;  // of the last norm, whatever the others have
+constexpr int kOutGroups = 8;  // groups of the last norm, independent of `n_group`
 
 std::vector<int> read_widths(const Scope& s) {
   std::vector<int> widths = s.integers("widths", {1, kMaxWidth});
@@ -39,7 +39,7 @@ UnetConvolution::UnetConvolution(const Scope& s, const Scope& norm, int d_in, in
     : convolution_(s, d_in, d_out, family.kernel_size), norm_(norm, d_out, family.n_group, family.norm_eps) {}
 
 Tensor UnetConvolution::operator()(Graph& g, Tensor x) const {
-  const Tensor y = convolution_(g, x);  // [d, n]: a view with one row of places
+  const Tensor y = convolution_(g, x);  // [d, n], which GroupNorm reads as one view with a single row
   return activate(g, norm_(g, y), Activation::mish);
 }
 
@@ -95,7 +95,7 @@ void Unet::prefix(Graph& g, Tensor observation, Cache& cache) const {
 Tensor Unet::operator()(Graph& g, Tensor x, Tensor condition, const Cache& cache) const {
   const std::size_t n_level = widths_.size();
   std::vector<Tensor> levels;
-  int first = 0;  // row of the condition
+  int first = 0;  // first row of the block's share in the condition
   auto block = blocks_.begin();
   const auto pass = [&](Tensor y) {
     for (const auto end = block + 2; block != end; first += block->d_film(), ++block) {

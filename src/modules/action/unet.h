@@ -12,7 +12,7 @@
 
 namespace vla {
 
-/// What all blocks of a U-Net have in common.
+/// The options that all blocks of a U-Net share.
 struct UnetFamily {
   int kernel_size, n_group;
   float norm_eps;
@@ -34,9 +34,9 @@ class UnetConvolution {
   GroupNorm norm_;
 };
 
-/// Two convolutions, between which the condition scales and shifts features, beside a shortcut. FiLM is linear in the
-/// condition, whose parts are the time and the observation: each part's share is computed at its own rate. Source:
-/// lerobot modeling_diffusion.py DiffusionConditionalResidualBlock1d.
+/// Two convolutions with FiLM between them, and a shortcut around both. FiLM is linear in the condition, which is made
+/// of time and observation, so each one's share is computed at its own rate and the shares are added. Source: lerobot
+/// modeling_diffusion.py DiffusionConditionalResidualBlock1d.
 class UnetBlock : public Module<UnetBlock> {
  public:
   UnetBlock(const Scope& s, int d_in, int d_out, const UnetFamily& family);
@@ -57,21 +57,21 @@ class UnetBlock : public Module<UnetBlock> {
   std::optional<Linear> shortcut_;
 };
 
-/// A U-Net over the rows of a chunk. Each of `widths` is a level of half as many tokens as the one before. Source:
-/// lerobot modeling_diffusion.py DiffusionConditionalUnet1d.
+/// A U-Net over the rows of a chunk. `widths` has the width of each level; a level has half as many tokens as the one
+/// before. Source: lerobot modeling_diffusion.py DiffusionConditionalUnet1d.
 class Unet {
  public:
-  /// Reads `widths`, and what UnetFamily reads.
+  /// Reads `widths` and the keys of UnetFamily.
   Unet(const Scope& s, int d_action, int d_observation);
   int d_time() const { return family_.d_time; }
-  /// Rows of a chunk must be a multiple of it.
+  /// The number of rows of a chunk must be a multiple of the stride.
   int stride() const { return 1 << (static_cast<int>(widths_.size()) - 1); }
 
   /// Load rate: the time's share of every block, one column per step: [d_time, n] -> [d, n].
   Tensor condition(Graph& g, Tensor time) const;
   /// Observation rate: puts the observation's share of every block into the cache. observation [d_observation, 1].
   void prefix(Graph& g, Tensor observation, Cache& cache) const;
-  /// Step rate: x [d_action, n] -> the same shape. `condition` is a column of the shares of the time.
+  /// Step rate: x [d_action, n] -> the same shape. `condition`: one column of the function `condition`.
   Tensor operator()(Graph& g, Tensor x, Tensor condition, const Cache& cache) const;
 
  private:

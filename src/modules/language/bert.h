@@ -6,8 +6,8 @@
 
 namespace vla {
 
-/// BERT over one sentence: BART's encoder over tokens plus the embedding of the first sentence. The pooler is left out.
-/// Source: transformers modeling_bert.py BertModel.
+/// BERT over one sentence: BART's encoder over the token embeddings plus the first sentence's embedding. The pooler is
+/// left out. Source: transformers modeling_bert.py BertModel.
 class Bert {
  public:
   explicit Bert(const Scope& s);

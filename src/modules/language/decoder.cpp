@@ -9,7 +9,7 @@
 namespace vla {
 namespace {
 
-/// [n, n].
+/// The identity matrix [n, n].
 Tensor identity(Graph& g, int n) {
   return g.constant("identity", {n, n, 1, 1}, [n] {
     std::vector<float> values(static_cast<std::size_t>(n) * static_cast<std::size_t>(n));

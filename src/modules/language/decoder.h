@@ -11,12 +11,12 @@
 
 namespace vla {
 
-/// What differs between families of decoders, as their references compute it.
+/// The options in which decoder families differ.
 struct DecoderFamily {
   Activation activation;  // activation of the gated MLP
   RotaryAngle rope_angle;
 };
-/// SmolVLA's own rotation on a Llama; Gemma as in transformers.
+/// kSmolLm: a Llama with SmolVLA's own rotary angles. kGemma: Gemma as in transformers.
 constexpr DecoderFamily kSmolLm = {Activation::silu, RotaryAngle::quotient};
 constexpr DecoderFamily kGemma = {Activation::gelu_tanh, RotaryAngle::product};
 
@@ -27,8 +27,8 @@ class DecoderBlock : public Module<DecoderBlock> {
   DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps);
   /// x [d_model, n], rotary [d_head, n], mask [n, n] or none -> the shape of x.
   Tensor forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Cache& cache) const;
-  /// The same for one token [d_model, 1] behind a prefix in the cache. Its keys and values are appended there; `mask`
-  /// [n_prefix + capacity, 1] hides the places after it.
+  /// The same for one token [d_model, 1] after a cached prefix. Appends the token's keys and values to the cache;
+  /// `mask` [n_prefix + capacity, 1] hides the positions after the token.
   Tensor next(Graph& g, Tensor x, Tensor rotary, Tensor mask, const AppendPlace& place, Cache& cache) const;
 
  private:
@@ -40,12 +40,12 @@ class DecoderBlock : public Module<DecoderBlock> {
   GatedMlp mlp_;
 };
 
-/// What a policy reads of a language model: keys and values of a prefix, or logits of the token that comes next.
+/// The output that a policy reads from a language model: keys and values of a prefix, or the logits of the next token.
 enum class DecoderOutput { keys_and_values, logits };
 
 /// A language model of the Llama or Gemma family as a policy uses it: it embeds tokens and computes keys and values of
-/// a prefix, layer by layer. Where nobody reads logits, the last layer stops at its keys and values, and there are no
-/// `norm` and `head`.
+/// a prefix, layer by layer. If the policy reads no logits, the last layer ends with its keys and values, and `norm`
+/// and `head` do not exist.
 class Decoder {
  public:
   Decoder(const Scope& s, DecoderFamily family, DecoderOutput output = DecoderOutput::keys_and_values);
@@ -53,11 +53,11 @@ class Decoder {
   /// tokens [n] i32 -> [d_model, n], not scaled.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_(g, tokens); }
   /// x [d_model, n], mask [n, n] or none for full attention -> cache `<path>.blk.<i>.{k,v}`, each [d_head, n_head_kv,
-  /// n], and `logits` [n_vocab] of the token after the last one.
+  /// n], and, if the policy reads them, the `logits` [n_vocab] of the token after the last one.
   void prefill(Graph& g, Tensor x, Tensor mask, Cache& cache) const;
 
-  /// Logits after token k ([1] i32) of at most `n_token` behind the prefix: x [d_model, 1] -> [n_vocab, 1]. Keys and
-  /// values of the tokens before it are in the cache.
+  /// Logits after token k ([1] i32) of at most `n_token` tokens after the prefix: x [d_model, 1] -> [n_vocab, 1]. Keys
+  /// and values of the tokens before token k are in the cache.
   Tensor next(Graph& g, Tensor x, Tensor k, int n_token, Cache& cache) const;
 
   /// The cached keys and values of layer i.

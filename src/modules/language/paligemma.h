@@ -22,10 +22,10 @@ class PaliGemma {
   int n_token(int width) const { return (width / vision_.patch_size()) * (width / vision_.patch_size()); }
   /// images [width, height, 3, n_view], tokens [n_text] i32 -> cache `lm.blk.<i>.{k,v}` of n_view * n_token + n_text
   /// tokens with full attention. The reference masks absent views and padding, which do not advance positions, so
-  /// leaving them out changes nothing. Where the language model answers tokens, also `logits` of the first.
+  /// leaving them out changes nothing. If the policy reads logits, also caches the `logits` of the first token.
   void prefill(Graph& g, Tensor images, Tensor tokens, Cache& cache) const;
 
-  /// Decoder::next of `token` [1] i32.
+  /// Decoder::next for the embedding of `token` [1] i32.
   Tensor next(Graph& g, Tensor token, Tensor k, int n_token, Cache& cache) const {
     return lm_.next(g, embed(g, token), k, n_token, cache);
   }

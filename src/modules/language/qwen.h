@@ -12,7 +12,7 @@
 
 namespace vla {
 
-/// What differs between generations, and where features are read.
+/// The options in which the model generations differ, and where features are read.
 struct QwenFamily {
   Bias bias;                                 // biases of queries, keys and values
   bool head_norms;                           // norms of queries and keys over each head
@@ -54,12 +54,13 @@ class Qwen {
 
   /// tokens [n] i32 -> [d_model, n]. A prompt is embedded in pieces, which have no taps.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_.forward(g, tokens); }
-  /// The same with views [d_model, n_view_token, n_view] at their places, whose ids are ignored.
+  /// The same with views [d_model, n_view_token, n_view] inserted at their places; the ids at these places are ignored.
   Tensor embed(Graph& g, Tensor tokens, Tensor views, const ViewPlaces& places) const;
   /// x [d_model, n] at positions 0 to n - 1, causal -> features [d_model, n].
   Tensor operator()(Graph& g, Tensor x) const;
-  /// The same, layer by layer: `each` gets the number of a layer, from 0, and what it returns, the last one behind the
-  /// final norm if there is one. Source: transformers modeling_qwen2.py Qwen2Model.forward (all_hidden_states).
+  /// The same, layer by layer: calls `each` with a layer's index, from 0, and the layer's output. The last output has
+  /// passed the final norm, if there is one. Source: transformers modeling_qwen2.py Qwen2Model.forward
+  /// (all_hidden_states).
   void layers(Graph& g, Tensor x, const std::function<void(int, Tensor)>& each) const;
   /// The same for given positions and mask [n, n].
   Tensor operator()(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const;

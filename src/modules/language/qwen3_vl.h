@@ -28,7 +28,7 @@ class Qwen3Vl {
 
   /// Errors: bad_bundle, unsupported.
   Status check(int width, int height, int n_view, int n_token) const;
-  /// Load rate: computes what depends on weights only.
+  /// Load rate: computes the values that depend only on weights.
   void keep(Graph& g, Cache& cache) const { vision_.keep(g, cache); }
   /// images [width, height, 3, max_views], tokens [n] i32, ignored at the images' places -> features [d_model, n].
   Tensor operator()(Graph& g, Tensor images, Tensor tokens, const Cache& cache) const;

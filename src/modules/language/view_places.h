@@ -34,7 +34,7 @@ class ViewPlaces {
   /// Inserts views [d, n_view_token, max_views] at their places between the rows [d, count] that `text` returns: [d,
   /// n_token].
   Tensor arrange(Graph& g, Tensor views, int n_token, const std::function<Tensor(const PromptPiece&)>& text) const;
-  /// Indices of the views' rows, and of all other rows.
+  /// Splits rows [d, n_token] into the rows of the views and all other rows.
   struct Rows {
     Tensor image, text;
   };
@@ -50,7 +50,7 @@ class ViewPlaces {
  private:
   int n_view_token_, min_tokens_ = 1;
   Count count_;
-  std::vector<int> counts_;  // as stored in the key
+  std::vector<int> counts_;  // the numbers in the key, not yet converted to starts
 };
 
 }  // namespace vla

@@ -19,7 +19,7 @@ class Windows {
 
   /// Windows with the same number of cells of the map.
   struct Kind {
-    int n_cell;             // of one window
+    int n_cell;             // cells of the map in one window
     int n_beyond;           // padding cells in a window
     std::vector<int> cell;  // cells of all these windows in order: row * n_column + column
   };
@@ -27,7 +27,7 @@ class Windows {
   bool reach_beyond() const;
   /// x [d, n, n_view] -> [d, n * n_view], tokens ordered by kind, view and window.
   Tensor cut(Graph& g, Tensor x) const;
-  /// The way back.
+  /// The inverse of `cut`. `like` is the tensor that was cut; the result has its shape.
   Tensor join(Graph& g, Tensor x, Tensor like) const;
 
  private:
@@ -36,7 +36,7 @@ class Windows {
   std::vector<Kind> kinds_;
 };
 
-/// One projection for queries, keys and values, and the output projection, with biases.
+/// The projections to queries, keys and values, and the output projection, with biases.
 struct AttentionProducts {
   AttentionProducts(const Scope& s, int d_model);
   Linear q, k, v, out;
@@ -48,7 +48,7 @@ struct DavitStage {
   float norm_eps;
 };
 
-/// What both kinds of blocks share: x + conv(x), attention, x + conv(x), MLP. Source: transformers
+/// The structure of both kinds of blocks: x + conv(x), attention, x + conv(x), MLP. Source: transformers
 /// modeling_florence2.py Florence2VisionSpatialBlock, Florence2VisionChannelBlock.
 class DavitBlock {
  public:
@@ -115,7 +115,7 @@ class Davit {
 
   /// images [width, height, 3, n_view], standardized -> [d_model, n_column, n_row, n_view].
   Tensor operator()(Graph& g, Tensor images, const Cache& cache) const;
-  /// Load rate.
+  /// Load rate: keys and values of padding cells, for all spatial blocks.
   void keep(Graph& g, Cache& cache) const;
   /// Checks that images have the size of the keys. Errors: unsupported.
   Status check(int width, int height) const;

@@ -11,12 +11,12 @@
 
 namespace vla {
 
-/// DINOv2's vision transformer, all views in one batch, as far as the block whose patches a policy reads. A class token
-/// and registers precede the patches, have no position, and are dropped at the end. Source: timm vision_transformer.py
+/// DINOv2's vision transformer, all views in one batch, up to the block whose patches a policy reads. A class token and
+/// registers precede the patches, have no position, and are dropped at the end. Source: timm vision_transformer.py
 /// VisionTransformer (reg_tokens, no_embed_class), get_intermediate_layers.
 class DinoV2 {
  public:
-  /// `d_condition`: width of the condition that FiLM modulates the blocks by, 0 without FiLM.
+  /// `d_condition`: width of the FiLM condition of all blocks, 0 without FiLM.
   explicit DinoV2(const Scope& s, int d_condition = 0);
 
   /// images [side, side, 3, n_view], standardized, condition [d_condition, 1] or none -> [d_model, n_patch, n_view].

@@ -15,7 +15,7 @@ namespace vla {
 /// DINOv3ViTModel.
 class DinoV3 {
  public:
-  /// `normed`: whether the patches pass the tower's last norm, else they are those of the last block.
+  /// `normed`: whether the patches pass the tower's final norm; otherwise they are the last block's output.
   explicit DinoV3(const Scope& s, bool normed = true);
 
   /// images [side, side, 3, n_view], standardized -> [d_model, n_patch, n_view]. `check` must have accepted the size.

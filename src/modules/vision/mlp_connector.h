@@ -7,9 +7,10 @@
 
 namespace vla {
 
-/// Fewer, wider image tokens through a norm and an MLP: squares of `<path>.factor`^2 patches become one token of the
-/// language model's width. Source: InternVL internvl_chat/internvl/model/internvl_chat/modeling_internvl_chat.py
-/// extract_feature; Isaac-GR00T Eagle-Block2A-2B-v2 modeling_eagle3_vl.py (whose features the converter reorders).
+/// Reduces the number of image tokens with a norm and an MLP: each square of `<path>.factor`^2 patches becomes one
+/// token of the language model's width. Source: InternVL
+/// internvl_chat/internvl/model/internvl_chat/modeling_internvl_chat.py extract_feature; Isaac-GR00T
+/// Eagle-Block2A-2B-v2 modeling_eagle3_vl.py (whose features the converter reorders).
 class MlpConnector : public Module<MlpConnector> {
  public:
   /// `n_row` x `n_column`: patches of a view.

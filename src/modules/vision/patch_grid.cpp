@@ -26,7 +26,7 @@ Stretch stretch(int i, int n, int n_side) {
   return {below, std::min(below + 1, n_side - 1), at - static_cast<float>(below)};
 }
 
-/// How many neighbours along one side of the table a patch sums.
+/// The neighbours along one side of the table that a patch sums, with their weights.
 struct Window {
   int first;
   std::vector<float> weights;

@@ -6,8 +6,8 @@
 
 namespace vla {
 
-/// Fewer, wider image tokens: squares of `<path>.factor`^2 patches become one token of the language model's width.
-/// Source: transformers modeling_smolvlm.py SmolVLMConnector.
+/// Reduces the number of image tokens: each square of `<path>.factor`^2 patches becomes one token of the language
+/// model's width. Source: transformers modeling_smolvlm.py SmolVLMConnector.
 class PixelConnector : public Module<PixelConnector> {
  public:
   PixelConnector(const Scope& s, int d_vision, int d_model);
@@ -15,7 +15,7 @@ class PixelConnector : public Module<PixelConnector> {
   Tensor forward(Graph& g, Tensor x) const;
   /// Checks that a grid of `side` x `side` patches can be divided. Errors: unsupported.
   Status check(int side) const;
-  /// How many tokens a grid of `side` x `side` patches becomes.
+  /// The number of tokens for a grid of `side` x `side` patches.
   int n_token(int side) const { return (side / factor_) * (side / factor_); }
 
  private:

@@ -15,8 +15,8 @@ namespace vla {
 /// The reference places patch i of n at the fraction i/n of the image and looks up the table's interval that holds
 /// it, all in floating point. Fractions that equal a boundary in exact arithmetic may fall on either side of it, so the
 /// result depends on the precision of the pixels and on the release (docs/bundle.md, `vision.position_rule`); the
-/// weights were trained with whatever came out. A grid for which the reference's own result depends on the vector width
-/// of the machine (its boundaries are made by torch.arange in blocks) has no right answer, and is refused. Source:
+/// weights are trained with that result. A grid for which the reference's own result depends on the vector width of the
+/// machine (its boundaries are made by torch.arange in blocks) has no right answer, and is refused. Source:
 /// transformers modeling_smolvlm.py SmolVLMVisionEmbeddings.forward.
 ///
 /// Towers whose images have one size only have no fractions: `row_major` gives patch i row i. Source: transformers

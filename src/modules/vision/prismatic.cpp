@@ -32,7 +32,7 @@ Status PrismaticVision::check(int width, int height, int n_text) const {
 }
 
 Tensor PrismaticVision::operator()(Graph& g, Tensor images, Tensor condition) const {
-  // One after the other, so that the graph's order is no compiler's choice.
+  // Evaluated in two steps, because the order of function arguments, and so of the graph, depends on the compiler.
   const Tensor of_dino = dino_(g, images, condition), of_siglip = siglip_(g, images, condition);
   const Tensor patches = concat_features(g, of_dino, of_siglip);
   const Tensor hidden = activate(g, projector_up_(g, patches), Activation::gelu_erf);

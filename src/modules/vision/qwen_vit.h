@@ -12,9 +12,9 @@
 
 namespace vla {
 
-/// Qwen3-VL's vision tower on single images, all views in one batch. An image counts as two equal frames with a patch
-/// projection each. Patches are ordered in squares of merge x merge; their places enter by a learned table and by
-/// rotary embedding. There is no final norm. Source: transformers modeling_qwen3_vl.py Qwen3VLVisionModel.
+/// Qwen3-VL's vision tower on single images, all views in one batch. An image is treated as two equal frames, each with
+/// its own patch projection. Patches are ordered in squares of merge x merge; their places enter by a learned table and
+/// by rotary embedding. There is no final norm. Source: transformers modeling_qwen3_vl.py Qwen3VLVisionModel.
 class QwenVit {
  public:
   explicit QwenVit(const Scope& s);
@@ -29,7 +29,7 @@ class QwenVit {
 
   int d_model() const { return d_model_; }
   float norm_eps() const { return norm_eps_; }
-  /// How many patches become one token.
+  /// The number of patches that become one token.
   int n_merged() const { return merge_ * merge_; }
   /// Tokens of a view: rows and columns.
   int n_token_row() const { return n_row_ / merge_; }

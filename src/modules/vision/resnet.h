@@ -10,16 +10,16 @@
 
 namespace vla {
 
-/// How ResNet's convolutions are normed: by groups of `group_width` features, or with 0 by frozen batch norms, which
+/// The norm after each convolution: group norm over `group_width` features, or if that is 0 a frozen batch norm, which
 /// vla-convert folds into the weights.
 struct ResNetNorm {
   int group_width = 0;
   float eps = 0;
-  /// Reads `group_width` and, where there is one, `norm_eps`.
+  /// Reads `group_width` and `norm_eps`; both are 0 without the key `group_width`.
   static ResNetNorm read(const Scope& s);
 };
 
-/// A convolution and the norm behind it, at `norm`.
+/// A convolution and the norm after it; `norm` is the norm's path.
 class NormedConvolution {
  public:
   NormedConvolution(const Scope& s, const Scope& norm, int d_in, int d_out, int size, int stride, ResNetNorm of);
@@ -49,13 +49,13 @@ class ResNet {
  public:
   /// Reads `n_block`, the blocks of each of the four stages, `image_width` and `image_height`, and the norm.
   explicit ResNet(const Scope& s) : ResNet(s, s) {}
-  /// With the keys of one path and the weights of another.
+  /// Reads keys from the path `keys` and weights from the path `s`.
   ResNet(const Scope& keys, const Scope& s);
   /// Checks that images have the size that the network was trained with. Errors: unsupported.
   Status check(int width, int height) const;
   static constexpr int kWidth = 512;  // channels of the last stage
   int d_model() const { return kWidth; }
-  /// Cells of the last feature map along a side of that many pixels. The first convolution, the pooling and the first
+  /// Cells of the last feature map along a side of `n_pixel` pixels. The first convolution, the pooling and the first
   /// block of three stages have a stride of two.
   static int n_cell(int n_pixel) { return (n_pixel + 31) / 32; }
   /// Cells of the last feature map of an image.

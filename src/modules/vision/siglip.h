@@ -15,8 +15,8 @@ namespace vla {
 /// SmolVLMVisionTransformer.
 class Siglip {
  public:
-  /// `post_norm`: features are read after a final norm, else after the last layer. `d_condition`: width of the
-  /// condition that FiLM modulates the blocks by, 0 without FiLM.
+  /// `post_norm`: features are read after a final norm, else after the last layer. `d_condition`: width of the FiLM
+  /// condition of all blocks, 0 without FiLM.
   explicit Siglip(const Scope& s, EncoderFamily family = kPlainEncoder, bool post_norm = true, int d_condition = 0);
 
   /// images [width, height, 3, n_view] in [-1, 1], condition [d_condition, 1] or none -> [d_model, n_patch, n_view].

@@ -8,15 +8,15 @@
 namespace vla {
 namespace {
 
-constexpr int kHead = 4;  // features of a head; its root divides scores
+constexpr int kHead = 4;  // features of a head; scores are divided by its square root
 
 }  // namespace
 
 SpatialSoftmax::SpatialSoftmax(const Scope& s, int d_in, int n_cell, int n_keypoint)
     : Module(s), map_(s, d_in, n_keypoint, Bias::yes), places_(s.vector("places", 2 * n_cell)) {}
 
-/// Attention with a head for each keypoint, whose query is (2, 0, 0, 0): the score of a cell is the first number of its
-/// key, since scores are divided by the root of the head's width. Its value is (column, row, 0, 0).
+/// An attention with one head per keypoint. The query is (2, 0, 0, 0) and scores are divided by sqrt(4), so a cell's
+/// score is the first number of its key. A cell's value is (column, row, 0, 0).
 Tensor SpatialSoftmax::forward(Graph& g, Tensor x) const {
   const Tensor map = map_.forward(g, x);
   const std::int64_t n_head = map.dim(0), n_cell = map.dim(1) * map.dim(2), n_view = map.dim(3);

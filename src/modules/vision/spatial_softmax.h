@@ -6,9 +6,9 @@
 
 namespace vla {
 
-/// Keypoints of a feature map: of each of `n_keypoint` linear maps of the features its softmax over all cells, and the
-/// mean by these weights of where the bundle says that they are. Source: lerobot
-/// policies/diffusion/modeling_diffusion.py SpatialSoftmax.
+/// Keypoints of a feature map. A linear map gives each cell `n_keypoint` scores; a keypoint is the mean position of the
+/// cells, weighted by the softmax of its scores over all cells. The bundle states the cells' positions (`places`).
+/// Source: lerobot policies/diffusion/modeling_diffusion.py SpatialSoftmax.
 class SpatialSoftmax : public Module<SpatialSoftmax> {
  public:
   SpatialSoftmax(const Scope& s, int d_in, int n_cell, int n_keypoint);

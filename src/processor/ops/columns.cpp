@@ -214,9 +214,9 @@ Status parse_action(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// Adds the state before its normalization to these columns. The sum is not rounded.
+/// Adds the state before normalization to these columns. The sum is not rounded.
 struct AddStateOp final : ActionOp {
-  std::vector<int> columns, state_columns;  // by default the same columns
+  std::vector<int> columns, state_columns;  // state_columns: `columns` by default
   Status bind(ActionLayout& layout, const std::string& where) override {
     layout.relative = true;
     VLA_CHECK(check_columns(columns, static_cast<std::size_t>(layout.width), where));

@@ -28,7 +28,7 @@ struct ColumnAffine {
 };
 
 /// Converts a gripper's opening, `x * scale + shift`, to the angle of the servo horn that drives it, from the lengths
-/// of horn and arm. One op, because near its end the angle depends on the opening's last digit.
+/// of horn and arm. One op, because near the end of the range the angle depends on the opening's last digit.
 struct HornAngle {
   std::vector<int> columns;
   double scale = 1.0;
@@ -45,7 +45,7 @@ struct Threshold {
   float otherwise = 0.0f;
 };
 
-/// In the selected columns: -1, 0 or 1.
+/// In the selected columns: the sign, -1, 0 or 1.
 struct Sign {
   std::vector<int> columns;
 };
@@ -75,8 +75,8 @@ struct Bins {
 /// `x * scale + shift`, in place, e.g. to flip a joint (scale -1) or to change a gripper's range.
 void map_columns(const ColumnAffine& op, std::span<float> values);
 
-/// Replaces a gripper's value, which stands for the opening x (metres), by the servo horn's angle (radians): asin((r^2
-/// + x^2 - a^2) / (2 r x)), with the argument clamped to [-1, 1]. Source: openpi policies/aloha_policy.py
+/// Replaces a gripper's value by the servo horn's angle (radians), asin((r^2 + x^2 - a^2) / (2 r x)) with the argument
+/// clamped to [-1, 1], where x = value * scale + shift is the opening (metres). Source: openpi policies/aloha_policy.py
 /// (_gripper_to_angular).
 void map_columns(const HornAngle& op, std::span<float> values);
 
@@ -90,7 +90,7 @@ void map_columns(const Sign& op, std::span<float> values);
 /// The sigmoid of every value, in place. Source: lerobot policies/xvla/action_hub.py (postprocess).
 void map_columns(const Sigmoid& op, std::span<float> values);
 
-/// Clamps its columns to the two values of a clip, in place. Values that are not finite stay, so that later checks find
+/// Clamps the columns of `op` to [low, high], in place. Values that are not finite stay, so that later checks find
 /// them.
 void hold(const Clip& op, std::span<float> values);
 

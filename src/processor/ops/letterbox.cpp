@@ -21,7 +21,7 @@ struct Tap {
   float low_weight, high_weight;
 };
 
-/// Those of the positions in `of`.
+/// The taps of the output positions in `of`.
 std::vector<Tap> make_taps(int n_in, int n_out, Rows of) {
   const float scale = static_cast<float>(n_in) / static_cast<float>(n_out);
   std::vector<Tap> taps;
@@ -48,7 +48,8 @@ struct FloatSource {
   float operator()(std::size_t i) const { return values[i]; }
 };
 
-/// Where an image of `width` x `height` is written: planes of `plane` floats, with rows `stride` apart.
+/// The memory to which an image of `width` x `height` is written: planes of `plane` floats, with rows `stride` floats
+/// apart.
 struct Target {
   float* out;
   std::size_t plane, stride;
@@ -66,7 +67,8 @@ void copy(Source source, const Target& to, Rows rows) {
       }
 }
 
-/// What the columns of the output read in a row of the source: (3, width) at their left and at their right position.
+/// The pixels of a source row that the output's columns read: (3, width) at each column's left and at its right
+/// position.
 struct SourceRow {
   int row = -1;
   std::vector<float> left, right;
@@ -90,7 +92,7 @@ struct ColumnWeights {
   std::vector<float> low, high;
 };
 
-/// A row of the output, of one channel. The loop has no dependence, so that the compiler makes vectors of it.
+/// Computes a row of the output, for one channel. The loop's iterations are independent, so the compiler vectorizes it.
 inline __attribute__((always_inline)) void sum_row(const Tap& row, const ColumnWeights& columns, const float* top_left,
                                                    const float* top_right, const float* bottom_left,
                                                    const float* bottom_right, float* __restrict out) {
@@ -122,7 +124,7 @@ __attribute__((target("fma"))) void sum_rows_fused(const Tap& row, const ColumnW
 }
 #endif
 
-/// Two neighbouring rows of the source are kept: where the image grows, the next rows of the output read them again.
+/// Keeps two neighbouring rows of the source, because the next output rows read them again if the image grows.
 template <class Source>
 void resample(Source source, int source_width, int source_height, const Target& to, Rows rows) {
   const std::vector<Tap> row_taps = make_taps(source_height, to.height, rows);
@@ -169,7 +171,7 @@ void place(const Frame& frame, const Target& target, Rows rows) {
   place(FloatSource{std::get<std::vector<float>>(frame.rgb).data()}, frame.width, frame.height, target, rows);
 }
 
-/// Fills what is left of the rows beside the image.
+/// Fills the part of the rows that the image does not cover.
 void fill(const Letterbox& to, const Target& target, std::span<float> out, int left, Rows rows, Rows image) {
   const auto n_left = static_cast<std::size_t>(left), stride = target.stride;
   const std::size_t end = n_left + static_cast<std::size_t>(target.width);
@@ -202,11 +204,11 @@ Status letterbox_rows(const Frame& frame, const Letterbox& to, Rows rows, std::s
                    fmt::format("an image that fits {} x {} with both sides", to.width, to.height),
                    fmt::format("{} x {}, which leaves a side shorter than a pixel", frame.width, frame.height)};
   }
-  const int share = to.align == Letterbox::Align::center ? 2 : 1;  // share of the padding at the left and top
+  const int share = to.align == Letterbox::Align::center ? 2 : 1;  // 1 / share of the padding is at the left and top
   const int top = (to.height - target.height) / share, left = (to.width - target.width) / share;
   fill(to, target, out, left, rows, {top, top + target.height});
   target.out += static_cast<std::size_t>(top) * stride + static_cast<std::size_t>(left);
-  // of the image
+  // From here on, rows of the image.
   rows = {std::clamp(rows.first - top, 0, target.height), std::clamp(rows.end - top, 0, target.height)};
   if (to.antialias) {
     const std::vector<std::uint8_t> bytes = resized_8bit(frame, target);
@@ -248,7 +250,7 @@ Result<Letterbox> read_letterbox(JsonFields& fields) {
 
 struct LetterboxFit final : OneFit<Letterbox> {
   explicit LetterboxFit(const Letterbox& given) : OneFit("letterboxed", letterbox, given) {}
-  /// Antialiasing makes the whole image before it spreads it over planes.
+  /// With antialiasing, the whole image is resized before it is spread over planes.
   bool makes_rows() const override { return !op.antialias; }
   Status apply_rows(const Frame& frame, Rows rows, std::span<float> planes, const std::string& where) const override {
     return letterbox_rows(frame, op, rows, planes, where);

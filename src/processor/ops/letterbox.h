@@ -19,12 +19,12 @@ struct Letterbox {
   int width = 0;
   int height = 0;
   std::array<float, 3> fill = {};  // per channel
-  // place of the image; with an odd rest `center` puts the smaller half at the left and top
+  // position of the image; of an odd padding, `center` puts the smaller half at the left and top
   Align align = Align::bottom_right;
   bool antialias = false;  // resamples like Pillow on 8-bit images, see below
 };
 
-/// Writes (3, height, width) float32 to `out`; 8-bit values are divided by 255. A frame that has the size already is
+/// Writes (3, height, width) float32 to `out`; 8-bit values are divided by 255. A frame that already has the size is
 /// copied. Otherwise it is resampled bilinearly, without antialiasing, to the largest size that fits.
 ///
 /// The result equals torch's bit for bit on machines where torch uses fused multiply-add: sizes are truncated from
@@ -32,13 +32,13 @@ struct Letterbox {
 /// policies/common/vla_utils.py resize_with_pad, resize_with_pad_torch; torch F.interpolate(mode="bilinear",
 /// align_corners=False).
 ///
-/// With `antialias` everything happens in 8 bits, and a float frame is first cut to them (255 x, without rounding); the
-/// result equals Pillow's. Source: openpi image_tools.py resize_with_pad; `resample_pillow_bilinear`.
+/// With `antialias` everything is computed in 8 bits, and a float frame is first truncated to bytes (255 x); the result
+/// equals Pillow's. Source: openpi image_tools.py resize_with_pad; `resample_pillow_bilinear`.
 ///
 /// Errors: bad_observation when a side of the resized image is shorter than a pixel.
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where);
 
-/// The same for some rows of `out`, which stays as it is elsewhere.
+/// The same for some rows of `out`; the other rows do not change.
 Status letterbox_rows(const Frame& frame, const Letterbox& to, Rows rows, std::span<float> out,
                       const std::string& where);
 

@@ -7,7 +7,7 @@
 
 namespace vla {
 
-/// Row by row.
+/// A 3 x 3 matrix, row by row.
 template <class T>
 using Matrix3 = std::array<T, 9>;
 

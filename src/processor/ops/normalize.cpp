@@ -79,7 +79,7 @@ Normalizer::Normalizer(const NormRule& rule, Direction direction, double eps, st
 
 namespace {
 
-/// Limits of plausible statistics: no robot measures values so large, and no deviation is negative.
+/// Checks that statistics are plausible: no robot measures values beyond kPlain, and no deviation is negative.
 Status check_statistics(const NormRule& rule, std::span<const double> low, std::span<const double> high,
                         const std::string& stats) {
   const bool is_deviation = rule.spread == NormRule::Spread::value;
@@ -151,8 +151,8 @@ struct Fields {
   const NormRule* rule = nullptr;  // null: identity
   std::string stats;               // prefix of the statistics' tensor names
   double eps = 0.0;
-  std::string feature;  // full name of its state feature; empty: the whole vector
-  SomeColumns columns;  // columns that it normalizes; the others pass unchanged
+  std::string feature;  // full name of the state feature; empty: the whole vector
+  SomeColumns columns;  // columns to normalize; the others pass unchanged
 
   bool reads(const std::string& tensor) const {
     return rule != nullptr &&
@@ -195,7 +195,7 @@ class NormalizeOp final : public StateOp {
 
  private:
   std::optional<Normalizer> normalizer_;  // none for identity
-  std::size_t offset_ = 0;                // column of its first statistic
+  std::size_t offset_ = 0;                // state column of the first statistic
   std::vector<bool> chosen_;              // for each value whether it is normalized
 };
 

@@ -19,12 +19,12 @@ namespace vla {
 ///   range      2 * (x - low) / spread - 1    (x + 1) / 2 * spread + low  spread = high - low
 struct NormRule {
   enum class Spread { value, range };
-  /// Where eps enters. divides: spread + eps where the spread is a divisor. replaces_zero: eps if the spread is exactly
-  /// 0. added: spread + eps in both directions. The others have no eps; if the spread is 0, zero maps x to 0, kept
-  /// leaves x unchanged, kept_both_ways also when unnormalizing.
+  /// How eps is used. divides: spread + eps when normalizing, where the spread is the divisor. replaces_zero: eps if
+  /// the spread is exactly 0. added: spread + eps in both directions. The other rules have no eps. If the spread is 0,
+  /// zero maps x to 0 and kept leaves x unchanged; kept_both_ways leaves it unchanged when unnormalizing, too.
   enum class Eps { divides, replaces_zero, added, zero, kept, kept_both_ways };
   /// numpy: float32 values and float64 statistics in one formula, as numpy evaluates it. Parts without statistics are
-  /// rounded to float32; what a range gives back is not rounded.
+  /// rounded to float32; the result of unnormalizing a range is not rounded.
   enum class Arithmetic { float32, float64, numpy };
 
   const char* kind;
@@ -42,7 +42,7 @@ struct NormRule {
 /// and modeling_prismatic.py (_unnormalize_actions); Evo-1 scripts/Evo1_server.py (Normalizer); Isaac-GR00T
 /// gr00t/data/utils.py, and gr00t/data/transform/state_action.py (Normalizer) for N1.5.
 std::span<const NormRule> norm_rules();
-/// The rule of a kind that exists.
+/// The rule of a kind, which must exist.
 const NormRule& norm_rule(std::string_view kind);
 
 /// Maps values between world units and the network's, per column, with operations in the reference's order.
@@ -70,7 +70,7 @@ class Normalizer {
   const NormRule* rule_;
   Direction direction_;
   std::vector<double> low_;     // row by row
-  std::vector<double> spread_;  // in the rule's precision
+  std::vector<double> spread_;  // spreads, with eps, in the rule's precision
   std::size_t row_step_ = 0;    // stride of rows; 0 if all rows share statistics
 };
 

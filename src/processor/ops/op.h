@@ -24,7 +24,7 @@ class JsonFields;
 struct Recipe;
 struct FloatResizes;
 
-/// A line of the table.
+/// An entry of the table.
 struct OpEntry {
   const char* list;  // image, text, state or action
   const char* name;
@@ -39,7 +39,7 @@ struct CameraSize {
   int height = 0;
 };
 
-/// Rows of an image, without `end`.
+/// The rows `first` to `end` - 1 of an image.
 struct Rows {
   int first, end;
 };
@@ -49,26 +49,26 @@ class Fit {
  public:
   virtual ~Fit() = default;
   virtual const char* described() const = 0;
-  /// The only frames of a view that are taken, where the recipe says so.
+  /// The only frame size that is accepted for a view, if the recipe states one.
   virtual std::optional<CameraSize> camera_size(int /*view*/) const { return {}; }
-  /// One more than the last view that the recipe names, 0 where it names none.
+  /// One more than the index of the last view that the recipe names, 0 if it names none.
   virtual int n_view() const { return 0; }
-  /// Its resizes in floats, behind which more may follow; null of any other fit.
+  /// The list of float resizes, to which later ops may append; null if this is another kind of fit.
   virtual FloatResizes* float_resizes() { return nullptr; }
-  /// What it computes beside making the planes, for a frame of this size, in pixels of about 10 ns.
+  /// The work besides writing the planes, for a frame of this size, in units of about 10 ns (one pixel).
   virtual std::int64_t work(int /*width*/, int /*height*/) const { return 0; }
   /// Writes (3, height, width) float32 in [0, 1] for this view. Errors: bad_observation, at `where`.
   virtual Status apply(const Frame& frame, int view, std::span<float> planes, const std::string& where) const = 0;
-  /// Whether it makes some rows of the planes alone, of any view, as fast as all of them together.
+  /// Whether `apply_rows` writes some rows alone, for any view, at no extra cost per row.
   virtual bool makes_rows() const { return false; }
-  /// Writes these rows of `planes`, where it does. Errors: those of `apply`.
+  /// Writes these rows of `planes`; only called if `makes_rows`. Errors: those of `apply`.
   virtual Status apply_rows(const Frame& frame, Rows /*rows*/, std::span<float> planes,
                             const std::string& where) const {
     return apply(frame, 0, planes, where);
   }
 };
 
-/// A fit by one function of what the recipe says.
+/// A fit that calls one function with the op's parameters.
 template <class Op>
 class OneFit : public Fit {
  public:
@@ -87,13 +87,13 @@ class OneFit : public Fit {
   Run* run_;
 };
 
-/// Changes each value of an image alone, by its channel.
+/// An op that changes each value of an image independently of the others, depending on its channel.
 class PlaneOp {
  public:
   static constexpr int kEveryView = -1;
 
   virtual ~PlaneOp() = default;
-  /// The view that it applies to: an index into the bundle's views, or kEveryView.
+  /// The view to which the op applies: an index into the bundle's views, or kEveryView.
   virtual int view() const { return kEveryView; }
   virtual void apply(std::span<float> values, std::size_t channel) const = 0;
 };
@@ -101,7 +101,7 @@ class PlaneOp {
 class TextOp {
  public:
   virtual ~TextOp() = default;
-  /// Whether it refuses instructions and changes none.
+  /// Whether the op only refuses instructions and never changes one.
   virtual bool refuses() const { return false; }
   /// `state`: the discretized state, for prompts that include it. Errors: bad_observation.
   virtual Result<std::string> apply(std::string text, std::span<const int> state) const = 0;
@@ -114,7 +114,7 @@ struct StateLayout {
   std::span<const int> dims;  // widths of the features
   std::size_t n_state;        // values of all features together
   std::size_t width;          // values after the ops so far
-  std::size_t n_unmoved;      // the leading values, whose places ops that widen a state keep
+  std::size_t n_unmoved;      // leading values that no earlier op has moved by widening the state
 };
 
 class StateOp {
@@ -128,9 +128,10 @@ class StateOp {
   /// bad_bundle.
   virtual Status bind(StateLayout&, const std::string& /*where*/) { return {}; }
   virtual void apply(std::span<float> /*state*/) const {}
-  /// Whether `apply` normalizes this value by statistics.
+  /// Whether `apply` normalizes this value with statistics.
   virtual bool normalizes(std::size_t /*column*/) const { return false; }
-  /// For kinds `widened` and `end`: makes the network's state and the prompt's. Errors: bad_observation.
+  /// For the stages `widened` and `end`: computes the network's state and the prompt's discretized state. Errors:
+  /// bad_observation.
   virtual Status finish(std::vector<float>& /*state*/, std::vector<int>& /*discretized*/) const { return {}; }
   virtual bool reads(const std::string& /*tensor*/) const { return false; }
 };
@@ -142,13 +143,13 @@ struct ActionLayout {
   int width;  // columns
   int first_row = 0;
   int n_row = 0;                    // rows, 0: all
-  bool relative = false;            // to the state
+  bool relative = false;            // whether actions are relative to the state
   std::set<int> unnormalized = {};  // columns
 };
 
 /// A row's index in its chunk, and the observation's state.
 struct RowPlace {
-  std::size_t index;                 // in the chunk
+  std::size_t index;                 // index of the row in the chunk
   std::span<const float> raw_state;  // the state before normalization
 };
 
@@ -157,17 +158,17 @@ class ActionOp {
   virtual ~ActionOp() = default;
   /// Reads statistics, checks sizes, and updates the layout. Errors: bad_bundle.
   virtual Status bind(ActionLayout& layout, const std::string& where) = 0;
-  /// Changes one row in place. Values are float32, unless an op says otherwise; the final ones are rounded.
+  /// Changes one row in place. Values are float32 unless an op documents otherwise; the final values are rounded.
   virtual void apply(std::vector<double>& row, const RowPlace& place) const = 0;
   /// Whether `apply` unnormalizes this column by statistics.
   virtual bool unnormalizes(std::size_t /*column*/) const { return false; }
   virtual bool reads(const std::string& /*tensor*/) const { return false; }
 };
 
-/// Largest image side and vector that a recipe may ask for, so that a damaged number cannot ask for all memory.
+/// Largest image side and vector size that a recipe may state, so that a damaged number cannot exhaust the memory.
 inline constexpr int kMaxImageSide = 8192;
 inline constexpr int kMaxVector = 65536;
-inline constexpr int kMaxViews = 64;                   // as many as Inputs::views has bits
+inline constexpr int kMaxViews = 64;                   // the number of bits in Inputs::views
 inline constexpr std::size_t kMaxOpText = 1 << 12;     // bytes of a text that an op searches for or writes
 inline constexpr std::size_t kMaxViewsText = 1 << 20;  // bytes that a views op adds
 

@@ -16,7 +16,8 @@
 namespace vla {
 namespace {
 
-/// Sides in double precision, in which the reference scales them: those of a sliver of an image may be out of reach.
+/// Sides in double precision, in which the reference scales them. Scaling a very narrow image may exceed an integer's
+/// range.
 struct Size {
   double width, height;
   bool operator==(const Size&) const = default;
@@ -60,7 +61,7 @@ Image cropped(const Image& from, const CenterCrop& op) {
   return to;
 }
 
-/// The image in the middle of another size: what is beyond it is cut off, what it does not reach is black.
+/// Centres the image in another size: crops what does not fit and fills the rest with black.
 Image centred(const Image& from, int width, int height) {
   Image to{width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * height * 3)};
   const int left = (width - from.width) / 2, top = (height - from.height) / 2;
@@ -75,7 +76,7 @@ Image centred(const Image& from, int width, int height) {
   return to;
 }
 
-/// Rows of pixels at the start of wider ones; the rest is zero.
+/// Copies rows of pixels to the start of wider rows; the rest is zero.
 template <class T>
 std::vector<T> on_canvas(std::span<const T> rgb, int width, const Canvas& canvas) {
   std::vector<T> out(static_cast<std::size_t>(canvas.width) * static_cast<std::size_t>(canvas.height) * 3);
@@ -86,13 +87,13 @@ std::vector<T> on_canvas(std::span<const T> rgb, int width, const Canvas& canvas
   return out;
 }
 
-/// Ops that make of a frame an image whose size the recipe does not state.
+/// Whether the size of the op's result follows from the frame and not from the recipe.
 bool follows_frame(const ByteOp& op) {
   return std::holds_alternative<SquarePad>(op) || std::holds_alternative<SmallestSide>(op);
 }
 
-/// The most pixels that such ops may make of a frame: four times its own, which leaves room for sides of 4 to 1, so
-/// that an act costs no more than the pixels that were admitted; of a small frame more.
+/// The maximum number of pixels after such ops, so that the size of the admitted frame limits the cost of an act: four
+/// times the frame's pixels, enough for an aspect of 4 to 1, and more for small frames.
 double most_pixels_grown(const Frame& frame) { return std::max(4.0 * frame.width * frame.height, 1024.0 * 1024.0); }
 
 Image applied(const ByteOp& op, const Image& from, int width, int height) {
@@ -115,7 +116,7 @@ Image applied(const ByteOp& op, const Image& from, int width, int height) {
   return centred(from, width, height);
 }
 
-/// Whether frames of the stated camera are the images, since no op changes a pixel.
+/// Whether no op changes a pixel, so that frames of the stated size are used as they are.
 bool keeps_pixels(const Pipeline& pipeline) {
   return !pipeline.ops.empty() && std::all_of(pipeline.ops.begin(), pipeline.ops.end(), [](const ByteOp& op) {
     return std::holds_alternative<ViewCamera>(op) || std::holds_alternative<ExpectSize>(op) ||
@@ -123,7 +124,7 @@ bool keeps_pixels(const Pipeline& pipeline) {
   });
 }
 
-/// Float pixels as planes: on the canvas, if there is one.
+/// Spreads float pixels over planes, on the canvas if there is one.
 void spread_floats(const std::vector<float>& rgb, int width, const Pipeline& pipeline, std::span<float> out) {
   const auto as_is = [](float value) { return value; };
   for (const ByteOp& op : pipeline.ops)
@@ -150,7 +151,7 @@ Status run_pipeline(const Frame& frame, int view, const Pipeline& pipeline, std:
     return Error{Code::bad_observation, where, "pixels of 8 bits", "float pixels",
                  "send the camera's bytes: this policy's images are cut and resized as bytes"};
   if (const ViewCamera* camera = camera_of(pipeline, view)) VLA_CHECK(check_camera(frame, camera->size, where));
-  // All sizes come before any image, so that none is made which nothing needs or no memory holds.
+  // Computes all sizes before any image, so that no image is made that is refused later or does not fit into memory.
   const double most_grown = most_pixels_grown(frame);
   std::vector<Size> sizes = {{static_cast<double>(frame.width), static_cast<double>(frame.height)}};
   bool fits = true;
@@ -199,8 +200,8 @@ Status check_camera(const Frame& frame, const CameraSize& camera, const std::str
 }
 
 std::int64_t pipeline_work(const Pipeline& pipeline, int width, int height) {
-  constexpr double kMost = 1e15;  // in place of what a sliver of an image would become
-  constexpr double kJpeg = 4.0;   // both ways
+  constexpr double kMost = 1e15;  // limit for images that are extremely narrow
+  constexpr double kJpeg = 4.0;   // encoding and decoding
   Size size = {static_cast<double>(width), static_cast<double>(height)};
   double n_read = 0.0;
   for (const ByteOp& op : pipeline.ops) {
@@ -238,7 +239,7 @@ struct PipelineFit final : Fit {
 Result<Pipeline*> open_pipeline(const JsonFields& fields, Recipe& recipe) {
   if (recipe.width > 0) return misplaced(fields, "images of any size before size, letterbox or resize");
   if (recipe.fit == nullptr) recipe.fit = std::make_unique<PipelineFit>();
-  return &static_cast<PipelineFit&>(*recipe.fit).op;  // every other fit has stated the size
+  return &static_cast<PipelineFit&>(*recipe.fit).op;  // every other fit has set recipe.width
 }
 
 Status add(const JsonFields& fields, Recipe& recipe, ByteOp op) {
@@ -295,7 +296,7 @@ Status parse_stated_size(JsonFields& fields, Recipe& recipe) {
   return add(fields, recipe, op);
 }
 
-/// Whether images have the aspect of the frame, whatever that is, because an op keeps it.
+/// Whether images keep the aspect of the frame, and frames may have any aspect.
 bool has_any_aspect(const Pipeline& pipeline) {
   bool any = false;
   for (const ByteOp& op : pipeline.ops) {

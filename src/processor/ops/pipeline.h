@@ -15,53 +15,55 @@
 
 namespace vla {
 
-/// Black on both sides of an image that is not square, until it is; of an odd rest less at the left and at the top.
+/// Pads an image with black on both sides to a square. Of an odd padding, the smaller half is at the left or at the
+/// top.
 struct SquarePad {};
 
-/// Both sides scaled so that the shorter one is `size`, as cv2.resize does with INTER_AREA.
+/// Scales both sides so that the shorter one is `size`, like cv2.resize with INTER_AREA.
 struct SmallestSide {
   int size = 0;
 };
 
-/// The middle of an image: this fraction of each side, cut to whole pixels, but one pixel at least.
+/// Crops the centre of an image: this fraction of each side, rounded down to whole pixels, at least one pixel.
 struct CropFraction {
   double fraction = 0.0;
 };
 
-/// Images of one size alone, which follows from the aspect of the camera's frames.
+/// Accepts only images of this size, which follows from the aspect of the camera's frames.
 struct ExpectSize {
   int width = 0;
   int height = 0;
 };
 
-/// Half of a whole number, as Python rounds it.
+/// Half of a whole number, rounded half to even like Python's round.
 constexpr int half_to_even(int whole) { return whole / 2 + (whole % 4 == 3 ? 1 : 0); }
 
-/// The middle of an image, no larger than it; of an odd rest that is cut off the half is rounded to even.
+/// Crops the centre of an image that is at least this large. The margin at the left and top is half of what is cut off,
+/// rounded half to even.
 struct CenterCrop {
   int width = 0;
   int height = 0;
 };
 
-/// The same by `resample_tensorflow_lanczos3`.
+/// Resizes by `resample_tensorflow_lanczos3`.
 struct Lanczos3 {
   int width = 0;
   int height = 0;
 };
 
-/// `crop_tensorflow`.
+/// Crops and resizes by `crop_tensorflow`.
 struct CropAndResize {
   double area = 0.0;
   int width = 0;
   int height = 0;
 };
 
-/// `codecs::through_jpeg`.
+/// Encodes and decodes by `codecs::through_jpeg`.
 struct JpegRoundTrip {
   int quality = 0;
 };
 
-/// Frames of one view's camera alone, or of every view's.
+/// Accepts only frames of this size, for one view or for every view.
 struct ViewCamera {
   static constexpr int kEvery = -1;
 
@@ -69,7 +71,7 @@ struct ViewCamera {
   int view = kEvery;
 };
 
-/// The image in the upper left corner of a larger one, which is black beyond it.
+/// Places the image in the upper left corner of a larger image, which is black elsewhere.
 struct Canvas {
   int width = 0;
   int height = 0;
@@ -85,19 +87,19 @@ struct Pipeline {
   std::vector<ByteOp> ops;
 };
 
-/// Writes (3, height, width) float32 to `out`: the resulting bytes, divided by 255. A frame of floats comes as it is
-/// where no op changes a pixel, and is refused otherwise, since the reference gets bytes; so is one whose aspect leads
-/// to another size than the network takes. Source: lerobot policies/groot/processor_groot.py
+/// Writes (3, height, width) float32 to `out`: the resulting bytes, divided by 255. A float frame is copied if no op
+/// changes a pixel, and refused otherwise, because the reference receives bytes. A frame whose aspect leads to another
+/// size than the network's is refused, too. Source: lerobot policies/groot/processor_groot.py
 /// (_transform_n1_7_image_for_vlm_albumentations). Errors: bad_observation.
 Status run_pipeline(const Frame& frame, int view, const Pipeline& pipeline, std::span<float> out,
                     const std::string& where);
 
-/// Checks that a frame is of the camera whose frames alone are taken. Errors: bad_observation.
+/// Checks that a frame has the only size that is accepted. Errors: bad_observation.
 Status check_camera(const Frame& frame, const CameraSize& camera, const std::string& where);
-/// Half a pixel for each that an op reads.
+/// The work of the ops (Fit::work): half a unit for each pixel that an op reads.
 std::int64_t pipeline_work(const Pipeline& pipeline, int width, int height);
 
-/// The op "resize" among others, by a filter on bytes.
+/// Parses the op "resize" as one of several ops, with a filter on bytes.
 Status parse_byte_resize(JsonFields& fields, Recipe& recipe);
 
 }  // namespace vla

@@ -9,8 +9,8 @@ namespace vla {
 
 /// `(x - mean) / std` of each channel of an image.
 struct Standardize {
-  /// Arithmetic: float32; every value and result rounded to bfloat16; only the last result rounded; or float32 in
-  /// bytes, where x, mean and std are 255 times as large, so that no division by 255 rounds.
+  /// bfloat16: every value and result is rounded to bfloat16. float32_then_bfloat16: only the final result is rounded.
+  /// float32_in_bytes: x, mean and std are multiplied by 255, so that no division by 255 rounds.
   enum class Arithmetic { float32, bfloat16, float32_then_bfloat16, float32_in_bytes };
 
   std::array<float, 3> mean{}, std{};  // red, green, blue

@@ -20,7 +20,7 @@ using Matrix = Matrix3<double>;
 
 Matrix transposed(const Matrix& m) { return {m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]}; }
 
-/// The nearest rotation to a matrix that is one up to rounding, by Newton's method.
+/// The nearest rotation to a matrix that is a rotation up to rounding errors, by Newton's method.
 Matrix nearest_rotation(Matrix m) {
   for (int step = 0; step < 2; ++step) {
     Matrix correction = product(transposed(m), m);
@@ -58,7 +58,7 @@ Matrix rotation_of_rows(const T* rows) {
 
 Matrix rotation_of_vector(const double* v) {
   const double angle = std::sqrt(dot(v, v)), square = angle * angle;
-  // For small angles the quotient by its series.
+  // For small angles, the quotient is computed by its series.
   const double scale = angle <= 1e-3 ? 0.5 - square / 48 + square * square / 3840 : std::sin(angle / 2) / angle;
   const double x = scale * v[0], y = scale * v[1], z = scale * v[2], w = std::cos(angle / 2);
   return {w * w + x * x - y * y - z * z, 2 * (x * y - z * w),           2 * (x * z + y * w),

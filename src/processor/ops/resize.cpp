@@ -37,7 +37,7 @@ Status resize(const Frame& frame, const Resize& to, std::span<float> out, const 
 
 namespace {
 
-/// Makes the planes as the first op; after others it is one of several ops on bytes.
+/// As the first op it writes the planes; after other ops it is one of several ops on bytes.
 Status parse(JsonFields& fields, Recipe& recipe) {
   if (recipe.fit != nullptr) return parse_byte_resize(fields, recipe);
   VLA_TRY(const Resize op, read_resize(fields, "resize"));

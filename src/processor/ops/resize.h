@@ -19,13 +19,13 @@ struct Resize {
 };
 
 /// Reads "width" and "height", at least two pixels each (torch reads the wrong rows of an image with one column), and
-/// "filter" of those that `op` takes. Errors: bad_bundle.
+/// "filter", one of those of `op`. Errors: bad_bundle.
 Result<Resize> read_resize(JsonFields& fields, std::string_view op);
 
-/// Writes (3, height, width) float32 to `out`: the resized bytes divided by 255, or what a filter on planes makes. A
-/// filter on bytes refuses float pixels, as its reference gets bytes only, unless its reference cuts them. Sources:
-/// lerobot policies/evo1/internvl3_embedder.py (_batched_resize_01); lerobot_policy_turbovla modeling_turbovla.py
-/// (TurboVLA._encode_images). Errors: bad_observation.
+/// Writes (3, height, width) float32 to `out`: the resized bytes divided by 255, or the output of a filter on planes. A
+/// filter on bytes refuses float pixels, because its reference receives bytes, unless its reference truncates floats to
+/// bytes. Sources: lerobot policies/evo1/internvl3_embedder.py (_batched_resize_01); lerobot_policy_turbovla
+/// modeling_turbovla.py (TurboVLA._encode_images). Errors: bad_observation.
 Status resize(const Frame& frame, const Resize& to, std::span<float> out, const std::string& where);
 
 }  // namespace vla

@@ -62,7 +62,7 @@ Result<Resize> read_size(JsonFields& fields) {
   return op;
 }
 
-/// Several in a row are one fit. The first may name the only frame size that is accepted.
+/// Consecutive resize_floats ops form one fit. The first may name the only frame size that is accepted.
 Status parse(JsonFields& fields, Recipe& recipe) {
   FloatResizes* const before = recipe.fit != nullptr ? recipe.fit->float_resizes() : nullptr;
   if ((recipe.fit != nullptr && before == nullptr) || !recipe.image.empty() || (before != nullptr && before->crop))
@@ -87,7 +87,7 @@ Status parse(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// Crops the middle of what was resized.
+/// Crops the centre of the resized image.
 Status parse_crop(JsonFields& fields, Recipe& recipe) {
   FloatResizes* const before = recipe.fit != nullptr ? recipe.fit->float_resizes() : nullptr;
   if (before == nullptr || before->crop || !recipe.image.empty())

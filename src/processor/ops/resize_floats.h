@@ -14,14 +14,15 @@
 
 namespace vla {
 
-/// Resizes frames in floats to one size after the other, by filters on floats; the last is the network's.
+/// Resizes float frames to several sizes in turn, with filters on floats, and crops the result. The final size is the
+/// network's.
 struct FloatResizes {
   std::optional<CameraSize> camera;  // the only frame size accepted, if it determines the images' size
   std::vector<Resize> sizes;
-  std::optional<CameraSize> crop;  // out of the middle of the last size; half of an odd rest is rounded to even
+  std::optional<CameraSize> crop;  // centre of the last size; half of the margin is rounded to even
 };
 
-/// Writes (3, height, width) float32 to `out`; bytes are divided by 255 first. Bicubic edges may leave [0, 1]. A step
+/// Writes (3, height, width) float32 to `out`; bytes are divided by 255 first. Bicubic edges may leave [0, 1]. A resize
 /// to the image's own size does nothing. Source: lerobot policies/vla_jepa/modeling_vla_jepa.py
 /// (VLAJEPAModel.predict_action); transformers models/qwen2_vl/image_processing_qwen2_vl.py, for float tensors;
 /// torchvision transforms/functional.py center_crop. Errors:

@@ -92,9 +92,9 @@ void write_euler_angles(const Axes& axes, const Matrix& m, std::span<double> out
 
 /// Replaces a rotation in the state by the first two rows of its matrix.
 struct RotationStateOp final : StateOp {
-  int from = 0;  // 0: quaternion, 1: axis and angle, from 2 on: an order of Euler angles
+  int from = 0;  // 0: quaternion, 1: axis times angle, 2 or more: kEulerOrders[from - 2]
   int column = 0;
-  bool scales = false;  // from [-1, 1] to [-1, 1], which loses digits as in the reference
+  bool scales = false;  // maps [-1, 1] to itself, which loses digits as in the reference
 
   Stage stage() const override { return Stage::widened; }
   Status bind(StateLayout& layout, const std::string& where) override {

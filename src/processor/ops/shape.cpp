@@ -110,7 +110,7 @@ Status parse_take(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// Keeps some rows of a chunk, which the robot executes: the first, or those behind rows of the past.
+/// Keeps the rows of a chunk that the robot executes: the first rows, or those after rows of the past.
 struct RowsOp final : ActionOp {
   int first = 0, count = 0;
   Status bind(ActionLayout& layout, const std::string& where) override {

@@ -14,8 +14,8 @@
 namespace vla {
 namespace {
 
-/// Replaces each feature whose columns it names by the sines of these columns, then their cosines. Source: Isaac-GR00T
-/// gr00t/data/utils.py (apply_sin_cos_encoding).
+/// Replaces each feature whose columns are in `columns` by the sines of these columns, followed by their cosines.
+/// Source: Isaac-GR00T gr00t/data/utils.py (apply_sin_cos_encoding).
 struct SinCosOp final : StateOp {
   std::vector<int> columns;
 
@@ -60,7 +60,7 @@ struct SinCosOp final : StateOp {
     std::size_t width;
     bool turns;
   };
-  std::vector<Span> spans_;  // of the features
+  std::vector<Span> spans_;  // one per feature
 };
 
 Status parse_sin_cos(JsonFields& fields, Recipe& recipe) {

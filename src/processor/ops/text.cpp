@@ -138,7 +138,7 @@ struct IfEmptyOp final : TextOp {
   }
 };
 
-/// The text as a list of Python prints it.
+/// The text as Python prints a list that contains it.
 struct PythonListOp final : TextOp {
   Result<std::string> apply(std::string text, std::span<const int>) const override {
     std::string out = python::list_of(text);

@@ -21,12 +21,12 @@ using Say = LinkMessage::Kind;
 
 constexpr int kStartPatience = 10'000, kEndPatience = 1'000;  // ms
 constexpr auto kBeat = std::chrono::milliseconds(200);
-// unanswered heartbeats: of a process that is stopped (SIGSTOP), of any process
+// maximum unanswered heartbeats: for a stopped process (SIGSTOP), for any process
 constexpr int kMaxStopped = 5, kMaxSilent = 50;
 constexpr auto kFirstDelay = std::chrono::milliseconds(100), kLongestDelay = std::chrono::milliseconds(5'000);
 constexpr auto kStable = std::chrono::seconds(10);
 constexpr std::size_t kEnvelope = 1 << 20;  // bytes by which a request may exceed the message that it was made from
-constexpr std::size_t kMaxKept = 64 << 10;  // bytes of an entry
+constexpr std::size_t kMaxKept = 64 << 10;  // bytes of a kept entry
 
 }  // namespace
 
@@ -64,7 +64,7 @@ Result<std::unique_ptr<Front>> DoorFront::open(net::Loop& loop, const ServerOpti
 DoorFront::DoorFront(net::Loop& loop, const ServerOptions& options, const Door& door)
     : loop_(loop), options_(options), door_(door), timer_(loop.context()) {}
 
-/// The process ends when its link closes, after it has told its clients.
+/// The process ends when its link closes, after it has answered its clients.
 DoorFront::~DoorFront() {
   link_.reset();
   if (process_.is_stopped() || !process_.wait_for(kEndPatience)) process_.kill();

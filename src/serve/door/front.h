@@ -24,7 +24,7 @@ class DoorFront final : public Front, Link::Handler {
   struct Door {
     const char *program, *option, *name, *scheme;  // vla-door-x, --x, x, x://
     std::string ServerOptions::*address;
-    /// The names that its clients use. Errors: usage if the protocol cannot carry what a policy takes.
+    /// The names that its clients use. Errors: usage if the protocol cannot carry the policy's inputs.
     Result<Names> (*names_of)(const ServerOptions& options, const v1::Description& description);
   };
   /// Binds the address and starts the process. Errors: usage, io, unsupported.
@@ -73,7 +73,8 @@ class DoorFront final : public Front, Link::Handler {
   bool is_begun_ = false;
   int n_silent_ = 0, n_failure_ = 0;  // unanswered heartbeats; failures in a row
   Clock::time_point started_ = {};
-  // numbers of connections: the last before the current process, and the newest
+  // generation_: number of process starts; first_: highest connection number before the current process; last_: highest
+  // connection number so far
   std::uint64_t generation_ = 0, first_ = 0, last_ = 0;
   std::map<std::uint64_t, Client> clients_;
   std::map<std::string, std::string> kept_;

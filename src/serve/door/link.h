@@ -16,12 +16,12 @@ namespace vla::serve {
 struct LinkMessage {
   enum class Kind : std::uint32_t {
     // From the server:
-    policy,    // text: the lines of --map; bytes: a v1::Description; from now on acts may arrive
+    policy,    // text: the lines of --map and the absent views; bytes: a v1::Description; from now on acts may arrive
     response,  // bytes: a v1::Response for the connection
     ping,
     // From the process:
     ready,    // sent once it has started
-    pong,     // to a ping
+    pong,     // the answer to a ping
     opened,   // text: the address of the connection
     request,  // bytes: a v1::Request from the connection
     refused,  // a call of the connection that was refused before it became a request

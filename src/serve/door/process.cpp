@@ -94,7 +94,7 @@ Process& Process::operator=(Process&& other) noexcept {
   return *this;
 }
 
-/// The state follows the name, which is in parentheses and may contain anything.
+/// In /proc/PID/stat, the state follows the name, which is in parentheses and may contain anything.
 bool Process::is_stopped() const {
   std::ifstream file(fmt::format("/proc/{}/stat", pid_));
   std::string line;

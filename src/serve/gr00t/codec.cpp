@@ -28,7 +28,7 @@ Error bad(std::string where, std::string expected, std::string found) {
 
 bool is_instruction(std::string_view key) { return key.starts_with("annotation.") || key == "task"; }
 
-/// A text within lists of one.
+/// Returns the value inside nested lists of one element.
 const Value& innermost(const Value& value) {
   const Value* at = &value;
   while (at->is_list() && at->items.size() == 1) at = &at->items[0];
@@ -50,7 +50,8 @@ struct Flattening {
     return {};
   }
 
-  /// Batches and series of frames are told here by name: their elements alone would look like a wrong size.
+  /// Records an array's framing and rank, and refuses batches and series of frames here, where the error can name the
+  /// key: later checks would only report a wrong size.
   Status look_at(const std::string& key, const Value& value, Framing framing) {
     VLA_TRY(const Array array, msgpack::array_of(value, printable(key)));
     observed.dialect.framing = framing;
@@ -108,7 +109,7 @@ std::vector<Group> groups_of(const v1::Description& description) {
 std::string without_prefix(const std::string& key) { return key.substr(key.find('.') + 1); }
 
 std::string message_of(const Error& error) {
-  if (error.where.empty()) return error.found;  // words of the reference
+  if (error.where.empty()) return error.found;  // the reference's own wording
   return fmt::format("{}: {}", code_name(error.code), printable(error.message()));
 }
 

@@ -13,13 +13,14 @@ namespace vla::serve::gr00t {
 /// Which release a client speaks, and thus how it reads the answer.
 struct Dialect {
   msgpack::Framing framing = msgpack::Framing::numpy;
-  bool is_n1_5 = false;     // `data` is the observation, and the answer a map without a batch list
+  bool is_n1_5 = false;     // `data` itself is the observation, and the answer is a map, not a list of two
   bool is_flat = false;     // keys such as `video.camera`, also in the answer
   bool is_batched = false;  // actions have a batch dimension of one
 };
 
-/// Extracts one observation from a request: maps flattened to keys such as `video.front`, and the text at `text`.
-/// Errors: bad_observation if it is not an observation, or has more than one observation or time step.
+/// One observation of a request: its maps flattened to keys such as `video.front`, and the text at `text`.
+/// `read_observation` fails with bad_observation if the request has no observation, or more than one observation or
+/// time step.
 struct Observed {
   Dialect dialect;
   msgpack::Value flat;  // points into the request's bytes and `keys`
@@ -37,7 +38,7 @@ std::string encode_modalities(const Dialect& dialect, const Names& names, const 
 
 std::string encode_error(const Error& error);
 std::string encode_ping();
-std::string encode_nothing();  // to `kill`
+std::string encode_nothing();  // the answer to `kill`
 std::string encode_reset();
 
 }  // namespace vla::serve::gr00t

@@ -11,7 +11,7 @@
 namespace vla::serve::gr00t {
 namespace {
 
-/// Words of the reference.
+/// An error in the reference's own wording.
 Error in_words(Code code, std::string words) { return {code, "", "", std::move(words)}; }
 
 Kind kind_of(const std::string& endpoint) {
@@ -30,7 +30,7 @@ class Front::Request final : public Call {
         envelope_(std::move(message.envelope)),
         bytes_(std::move(message.bytes)) {}
 
-  /// The endpoint that it is for. Errors: bad_request, bad_observation.
+  /// Decodes the request and returns its endpoint. Errors: bad_request, bad_observation.
   Result<std::string> read() {
     VLA_TRY(message_, msgpack::read(bytes_.span()));
     if (!message_.is_map()) return Error{Code::bad_request, "request", "a map", "another type"};
@@ -66,7 +66,7 @@ class Front::Request final : public Call {
   void send_out_of_memory() noexcept override try {
     bytes_ = {};
     send(encode_error(out_of_memory("request")));
-  } catch (const std::exception&) {  // not even for that: the client's patience ends it
+  } catch (const std::exception&) {  // no memory even for the error; the client times out
   }
 
  private:
@@ -74,7 +74,7 @@ class Front::Request final : public Call {
   const std::uint64_t connection_;
   const zmtp::Envelope envelope_;
   net::Bytes bytes_;
-  msgpack::Value message_;  // over the bytes, as what follows
+  msgpack::Value message_;  // refers to `bytes_`, like `observed_`
   Observed observed_;
 };
 

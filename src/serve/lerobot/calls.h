@@ -25,13 +25,13 @@ struct Rpc {
   std::string message;  // SendObservations: the joined data of its pieces; else a serialized message
 };
 
-/// Whoever answers calls.
+/// Receives calls, and answers them by `Calls`.
 class CallHandler {
  public:
   virtual ~CallHandler() = default;
   /// Handles a call; `answer` or `refuse` ends it, now or later.
   virtual void called(Rpc rpc) = 0;
-  /// The client no longer waits for it.
+  /// The client no longer waits for the call.
   virtual void cancelled(std::uint64_t id) = 0;
   virtual void opened(const Peer& peer) = 0;
   /// A connection has ended. `why`: one word of observe/observer.h if it was ended here, else empty.

@@ -63,13 +63,13 @@ const Names::Entry* view_of(const Names& names, std::string_view key) {
   return found == names.views.end() ? nullptr : &*found;
 }
 
-/// The name of a state's number i if the checkpoint gives none.
+/// The name of the state's dimension i if the checkpoint gives none.
 std::string placeholder(const v1::StateSpec& state, std::size_t i) {
   return fmt::format("{}.{}", state.name().substr(state.name().rfind('.') + 1), i);
 }
 
-/// A number of another joint would be taken for this one's without a word: names are compared where the bundle has
-/// them.
+/// Compares the motors with the state's dimensions, by name where the bundle has names: a reading of another joint must
+/// not pass silently.
 Status check_motors(const std::vector<std::string>& motors, const v1::StateSpec& state, bool is_in_order) {
   const auto told = [](const std::vector<std::string>& names) {
     return fmt::format("{}: {}", names.size(), printable(fmt::format("{}", fmt::join(names, ", "))).substr(0, 1000));

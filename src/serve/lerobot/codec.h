@@ -18,8 +18,8 @@ Result<Names> lerobot_names(Given given, const v1::Description& description);
 /// A robot's setup, sent before its first observation: its cameras, and which readings form the state.
 struct Setup {
   struct Camera {
-    std::string key;            // in an observation
-    const Names::Entry* entry;  // of the policy
+    std::string key;            // the camera's key in an observation
+    const Names::Entry* entry;  // the policy's view
   };
   std::vector<std::string> motors;  // in the order of the state
   std::vector<Camera> cameras;
@@ -41,7 +41,7 @@ struct Observed {
   double timestamp = 0;  // seconds, by the robot's clock
   bool must_go = false;
   std::vector<float> state;  // in the robot's units
-  std::string module;        // of its classes
+  std::string module;        // Python module of its class; the answer uses the same
 };
 /// Errors: bad_request, bad_observation.
 Result<Observed> read_observation(const pickle::Pickle& message, const Setup& setup);
@@ -58,7 +58,7 @@ std::string encode_actions(const v1::ActionChunk& chunk, const Observed& observe
 /// Decides which observations of a robot are computed, by the reference's rules.
 class Filter {
  public:
-  /// The robot starts over; the last computed observation is still known.
+  /// Forgets the computed timesteps because the robot starts over; keeps the last computed observation.
   void begin() { computed_.clear(); }
   /// Whether an observation is computed: always if it says must_go or is the first; else if its timestep has no chunk
   /// yet and its state differs by at least 1, in the robot's units, from that of the last computed one.

@@ -240,7 +240,7 @@ class Reader {
     return push_container(type, n);
   }
   Status push_tuple(std::size_t n) { return n_free() < n ? nothing() : push_container(Type::list, n); }
-  /// Pops the values above the last mark.
+  /// Returns how many values lie above the last mark.
   std::size_t n_free() const { return stack_.size() - (marks_.empty() ? 0 : marks_.back()); }
   Status push_container(Type type, std::size_t n) {
     VLA_CHECK(push({.type = type}));

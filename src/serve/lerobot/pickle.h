@@ -20,13 +20,13 @@ struct Value {
   enum class Type { none, boolean, integer, real, text, bytes, list, map, array, object, name, dtype };
 
   Type type = Type::none;
-  std::int64_t integer = 0;  // also of a boolean
-  double real = 0;           // also of an integer or boolean
-  std::string_view data;     // text and bytes; of a dtype its letters, such as f4
-  std::string_view name;     // `module.name` of a class or function, or of an object's class; of a dtype its byte order
+  std::int64_t integer = 0;  // also a boolean's value
+  double real = 0;           // also an integer's or boolean's value
+  std::string_view data;     // content of text or bytes; a dtype's letters, such as f4
+  std::string_view name;     // `module.name` of a class or function, or of an object's class; a dtype's byte order
   std::vector<const Value*>
-      items;  // of a list or tuple; of a map, keys and values by turns; of an object, its map of attributes
-  std::unique_ptr<const serve::Array> array;  // of an array, which is built in two steps; null before the second
+      items;  // a list's or tuple's items; a map's keys and values in turn; an object's map of attributes
+  std::unique_ptr<const serve::Array> array;  // an array; null between the two steps that build it
 
   bool is_number() const { return type == Type::boolean || type == Type::integer || type == Type::real; }
   /// Returns the value at a text key; null if the key is missing or this has no keys.
@@ -35,7 +35,7 @@ struct Value {
 
 constexpr std::size_t kMaxSteps = 1 << 14;               // opcodes per message
 constexpr std::size_t kMaxMarks = 64;                    // containers open at once
-constexpr std::size_t kMaxTexts = 2 * serve::kMostText;  // bytes of all texts: an instruction, and names
+constexpr std::size_t kMaxTexts = 2 * serve::kMostText;  // bytes of all texts together: an instruction, and names
 
 /// Reads a message of Python's pickle, protocol 2 to 5, without executing anything. Names of classes and functions are
 /// compared with those that LeRobot's clients and NumPy's arrays use, and stand for data. Errors: bad_request for any
@@ -61,7 +61,7 @@ class Writer {
   Writer& real(double value);
   /// A class or function.
   Writer& name(std::string_view module, std::string_view name);
-  /// The end, and the bytes.
+  /// Ends the pickle and returns its bytes.
   std::string take() { return op('.'), std::move(out_); }
 
  private:

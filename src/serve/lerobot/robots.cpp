@@ -108,7 +108,7 @@ Status Robots::observe(const Rpc& rpc, Client& client) {
   return {};
 }
 
-/// Drops one observation of the group that holds most.
+/// Drops observations until all of them fit the limit, each from the group that holds most.
 void Robots::bound_seen() {
   for (;;) {
     net::Standings all;

@@ -28,8 +28,8 @@ class Robots final : public CallHandler {
     virtual void keep(const std::string& address, const std::string& bytes) = 0;
   };
   struct Limits {
-    std::size_t observed = 0;   // bytes of unrequested observations, of all robots
-    std::size_t message = 0;    // of one
+    std::size_t observed = 0;   // bytes of all robots' observations that no call has requested yet
+    std::size_t message = 0;    // bytes of one observation
     std::size_t addresses = 0;  // addresses whose setups are remembered
   };
   Robots(Now now, const Limits& limits, Calls& calls, Server& server)
@@ -45,9 +45,9 @@ class Robots final : public CallHandler {
   void closed(const Peer& peer, const std::string& why, const std::string& detail) override;
   /// Takes the server's answer, a serialized v1::Response, to a request of the connection.
   void answered(std::uint64_t connection, std::span<const std::byte> response);
-  /// Once a second.
+  /// Call it once a second: a call that has waited too long for actions gets an empty answer.
   void sweep();
-  /// Refuses what waits.
+  /// Refuses the waiting calls.
   void stop();
 
  private:
@@ -71,7 +71,7 @@ class Robots final : public CallHandler {
     Shared setup;
     Filter filter;
     std::optional<Seen> seen;              // the newest observation to compute
-    std::deque<Waiting> waiting;           // for actions
+    std::deque<Waiting> waiting;           // calls that wait for actions
     std::map<std::uint64_t, Asked> asked;  // keyed by request number
     std::uint64_t n_request = 0;
     Clock::time_point used = {};

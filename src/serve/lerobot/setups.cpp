@@ -48,8 +48,8 @@ bool Setups::is_ambiguous(const std::string& address) const {
   return found != places_.end() && (found->second.setup == nullptr || !found->second.has_ended);
 }
 
-/// Format: one byte, whether there are several setups; then the setup. A process that reads it has lost all
-/// connections.
+/// Format: `s` if there are several setups; else `o`, then the setup. `has_ended` is not stored: the process that reads
+/// this has lost all connections.
 std::string Setups::bytes_of(const std::string& address) const {
   const auto found = places_.find(address);
   if (found == places_.end()) return {};

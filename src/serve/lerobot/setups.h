@@ -23,7 +23,7 @@ class Setups {
 
   /// A connection of the address now has this setup. Returns whether that changes what is known of the address.
   bool had(const std::string& address, const Shared& setup, Clock::time_point now);
-  /// A connection with a setup has ended. Returns the same.
+  /// A connection with a setup has ended. Returns whether that changes what is known of the address.
   bool ended(const std::string& address, Clock::time_point now);
   /// The setup for a connection without one; null if there is none or several.
   Shared for_return(const std::string& address) const;

@@ -38,7 +38,7 @@ Result<Array> of_npy(const Value& value, const std::string& where) {
   return Array::make(type, {header.shape.begin(), header.shape.end()}, file.substr(header.data_at), where);
 }
 
-/// A scalar of openpi's framing has its value as a plain one.
+/// Reads a plain number. A scalar in openpi's framing contains one.
 Result<float> plain_number(const Value& value, const std::string& where) {
   if (value.type == Type::integer) return static_cast<float>(value.integer);
   if (value.type == Type::real) return static_cast<float>(value.real);

@@ -31,7 +31,7 @@ Result<Array> array_of(const Value& value, const std::string& where);
 /// The elements as float32: of an array, a scalar, a number or a list of numbers. Errors: bad_observation.
 Result<std::vector<float>> floats_of(const Value& value, const std::string& where);
 
-/// Text that came as text, as bytes in UTF-8 or as a NumPy string. Errors: bad_observation.
+/// Reads text that was sent as text, as bytes in UTF-8 or as a NumPy string. Errors: bad_observation.
 Result<std::string> text_of(const Value& value, const std::string& where);
 
 }  // namespace vla::msgpack

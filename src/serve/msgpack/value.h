@@ -20,7 +20,7 @@ struct Value {
   bool boolean = false;
   std::int64_t integer = 0;
   double real = 0;
-  std::string_view data;     // of text or bytes
+  std::string_view data;     // content of text or bytes
   std::vector<Value> items;  // items of a list; alternating keys and values of a map, whose keys are text or bytes
 
   bool is_text() const { return type == Type::text; }
@@ -31,9 +31,9 @@ struct Value {
   const Value* find(std::string_view key) const;
 };
 
-constexpr std::size_t kMaxValues = 4096;  // limits of a message; an array counts as bytes
+constexpr std::size_t kMaxValues = 4096;  // values of a message; an array's data is one value, its bytes
 constexpr std::size_t kMaxDepth = 8;
-constexpr std::size_t kMaxTexts = 2 * serve::kMostText;  // bytes of all of them: an instruction, and names
+constexpr std::size_t kMaxTexts = 2 * serve::kMostText;  // bytes of all texts together: an instruction, and names
 
 /// Parses one whole message. Errors: bad_request if it is truncated, has bytes left over, an extension type, a key that
 /// is not text or bytes or occurs twice, text that is not UTF-8, or more values, levels or text than the limits.

@@ -24,7 +24,7 @@ Writer& Writer::text(std::string_view v) {
 Writer& Writer::bytes(std::string_view v) {
   return Packer(*this).pack_bin(u32(v.size())).pack_bin_body(v.data(), u32(v.size())), *this;
 }
-/// Our own: the library writes floats without a fraction as integers.
+/// Writes the bytes itself: the library writes floats without a fraction as integers.
 Writer& Writer::real(double v) {
   std::uint64_t bits;
   std::memcpy(&bits, &v, sizeof bits);

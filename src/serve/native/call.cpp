@@ -11,7 +11,7 @@ Result<ActRequest> NativeCall::decode(const ServedPolicy& policy) {
   VLA_TRY(const std::string embodiment, named_embodiment(act));
   VLA_TRY(const Robot* robot, policy.engine->robot(embodiment));
   ActLimits limits = act_limits(options_, *robot);
-  limits.max_views = policy.description.limits().max_views();  // of all robots, as the description tells
+  limits.max_views = policy.description.limits().max_views();  // the maximum over all robots, from the description
   return decode_act(act, limits, robot->processor().views(), robot->processor().states());
 }
 

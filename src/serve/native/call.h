@@ -7,7 +7,7 @@
 
 namespace vla::serve {
 
-/// A request that is a serialized v1::Request, whoever brought it.
+/// A request that is a serialized v1::Request, from any front end.
 class NativeCall : public Call {
  public:
   NativeCall(const ServerOptions& options, net::Bytes bytes, const wire::Envelope& envelope)

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Requests, from bytes to what the engine takes.
+// Decodes requests into the engine's inputs.
 #include <fmt/format.h>
 
 #include <array>
@@ -40,11 +40,11 @@ std::string_view text_of(std::span<const std::byte> bytes) {
 
 struct Row {
   std::string_view types;
-  const char* names = "";  // where its names are, for errors
+  const char* names = "";  // the field that errors about names refer to
 };
 
-/// The fields of a message in the order of their numbers, from 1: v varint, u one of 32 bits, b bytes, t text, n a
-/// name, f floats (packed or not), d double, c count, and a digit for a message, the index of its own row.
+/// The fields of a message in the order of their numbers, from 1: v is a varint, u a varint of 32 bits, b bytes, t
+/// text, n a name, f floats (packed or not), d a double, c a count, and a digit a message, by the index of its own row.
 constexpr std::array<Row, 10> kFields = {{
     {"15t3vvv7nn9", "embodiment"},  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover,
                                     // embodiment, policy, loop
@@ -68,7 +68,7 @@ bool fits(const Fields& field, char type) {
   return field.type == 'b' || (type == 'f' && field.type == 'f');
 }
 
-/// Text has its limit before anybody looks at it.
+/// Checks the size of a text before anything reads it.
 Status check_size(const Fields& text, bool is_name, const char* names, std::size_t max_text) {
   const std::size_t most = is_name ? kMaxName : max_text, size = text.value.size();
   if (size <= most) return {};
@@ -76,8 +76,8 @@ Status check_size(const Fields& text, bool is_name, const char* names, std::size
                    fmt::format("{} bytes", size));
 }
 
-/// Whether a message holds known fields only, each in its own encoding. Protobuf would skip any other, and what it
-/// skipped might have changed the answer: a seed in a wrong encoding would become a fresh one.
+/// Checks that a message has only known fields, each in its own encoding. Protobuf would skip any other field, although
+/// the field might change the answer: a seed in a wrong encoding would become a fresh one.
 Status check_fields(std::span<const std::byte> bytes, std::size_t row, const char* where, std::size_t max_text) {
   const auto& [types, names] = kFields[row];
   for (Fields field(bytes, where);;) {
@@ -153,7 +153,7 @@ Result<codecs::ImageHeader> read_header(const v1::View& view, const std::string&
   return codecs::ImageHeader{static_cast<int>(width), static_cast<int>(height), width * height};
 }
 
-/// An act costs what its images cost together. `left` is what this one leaves to the next.
+/// Subtracts an image's cost from `left`, the budget that an act's images share.
 Status check_cost(const v1::View& view, const std::string& where, ActLimits& left) {
   if (view.has_absent() || view.image_case() == v1::View::IMAGE_NOT_SET) return {};
   VLA_TRY(const codecs::ImageHeader header, read_header(view, where, left));
@@ -165,7 +165,7 @@ Status decode_views(const v1::Act& act, const ActLimits& limits, const FeatureNa
   if (static_cast<std::size_t>(act.views_size()) > limits.max_views)
     return too_large("views", fmt::format("at most {} views", limits.max_views), std::to_string(act.views_size()));
   ActLimits left = limits;
-  for (const v1::View& view : act.views()) {  // all of them before any image is decoded
+  for (const v1::View& view : act.views()) {  // checks all views before it decodes an image
     VLA_CHECK(check_cost(view, features.place(view.name()), left));
   }
   for (const v1::View& view : act.views()) {
@@ -198,11 +198,11 @@ Status decode_start(const v1::Act& act, const ActLimits& limits, ActRequest& req
   if (noise.horizon() != n_row || noise.d_action() != d_noise)
     return bad_observation("noise", fmt::format("{} rows of {}", n_row, d_noise),
                            fmt::format("{} rows of {}", noise.horizon(), noise.d_action()));
-  request.noise = std::vector<float>(noise.values().begin(), noise.values().end());  // the engine checks its numbers
+  request.noise = std::vector<float>(noise.values().begin(), noise.values().end());  // the engine checks the values
   return {};
 }
 
-/// The engine checks its numbers; what it cannot see is whether rows and columns changed places.
+/// Checks the shape of the leftover. The engine checks its values, but cannot see whether rows and columns are swapped.
 Status decode_leftover(const v1::Act& act, const ActLimits& limits, ActRequest& request) {
   if (!act.has_leftover()) return {};
   const v1::Leftover& given = act.leftover();

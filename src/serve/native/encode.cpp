@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Answers, from what the engine gives to their messages.
+// Encodes the engine's results as messages.
 #include "engine/description.h"
 #include "processor/unicode.h"
 #include "serve/native/codec.h"
@@ -9,7 +9,7 @@
 namespace vla::serve {
 namespace {
 
-/// Protobuf's text is UTF-8, which a file name need not be.
+/// Replaces invalid bytes by `?`: Protobuf's text must be UTF-8, and a file name may be anything.
 std::string utf8(std::string bytes) {
   for (std::size_t bad = 0; (bad += unicode::valid_prefix(std::string_view(bytes).substr(bad))) < bytes.size();)
     bytes[bad] = '?';

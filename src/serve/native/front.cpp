@@ -14,8 +14,8 @@
 namespace vla::serve {
 namespace {
 
-/// Who can reach the server can move the robot: clients on other machines need a key, unless the user allows all with
-/// --insecure.
+/// Whoever can reach the server can move the robot: clients on other machines need a key, unless the user allows all
+/// with --insecure.
 Result<std::optional<zmtp::CurveKeys>> guard(const ServerOptions& options) {
   const bool has_keys = !options.curve_secret.empty();
   if (has_keys != !options.curve_clients.empty())
@@ -51,7 +51,7 @@ class NativeFront::Request final : public NativeCall {
  private:
   NativeFront& front_;
   const std::uint64_t connection_;
-  const zmtp::Envelope before_;  // the answer
+  const zmtp::Envelope before_;  // frames that precede the answer
 };
 
 Result<std::unique_ptr<NativeFront>> NativeFront::open(net::Loop& loop, const ServerOptions& options) {
@@ -91,7 +91,7 @@ void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
   std::uint64_t request_id = 0;
   try {
     Status valid = message.refused ? Status(*message.refused) : Status();
-    wire::Envelope envelope;  // first: a refusal for lack of memory has the request's number
+    wire::Envelope envelope;  // read first, so that a refusal for lack of memory has the request's number
     const Status read = wire::read_envelope(message.bytes.span(), envelope);
     request_id = envelope.request_id;
     if (valid) valid = read;
@@ -117,18 +117,18 @@ void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
   }
 }
 
-/// Refuses a request for want of memory: what was answered otherwise has been freed by now.
+/// Refuses a request for lack of memory.
 void NativeFront::send_out_of_memory(std::uint64_t connection, std::uint64_t request_id,
                                      const zmtp::Envelope& before) noexcept try {
   hub_.send(connection, refusal(request_id, out_of_memory("request")), before);
-} catch (const std::exception&) {  // not even for that: the client's patience ends it
+} catch (const std::exception&) {  // no memory even for that; the client times out
 }
 
 void NativeFront::handle(zmtp::Client& client, Job job, const wire::Envelope& envelope, const Status& valid) {
   if (!valid) return io_->refuse(std::move(job), [&] { return valid.error(); });
   if (job.kind == Kind::act) return io_->submit(std::move(job));
   auto response = answer_now(client, job, envelope);
-  job.name = client.name;  // a hello tells it
+  job.name = client.name;  // a hello sets it
   if (!response) return io_->refuse(std::move(job), [&] { return response.error(); });
   io_->answer(std::move(job), response->SerializeAsString());
 }

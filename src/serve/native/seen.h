@@ -8,8 +8,9 @@
 
 namespace vla::serve {
 
-/// The picture that the network gets of one view of an act (picture_of), for the robot that the act names. It costs at
-/// most what an act of this view may cost. Any thread may call it. Errors: bad_observation, too_large.
+/// Returns the picture that the network gets of one view of an act (picture_of), for the robot that the act names. The
+/// view may cost at most `max_pixels`, as in an act with this view alone. Any thread may call it. Errors:
+/// bad_observation, too_large.
 Result<Frame> seen(const v1::Act& act, int view, const Engine& engine, std::int64_t max_pixels);
 
 }  // namespace vla::serve

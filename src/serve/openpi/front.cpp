@@ -52,7 +52,7 @@ class Front::Request final : public Call {
   const std::uint64_t connection_;
   const std::optional<double> previous_ms_;
   const std::string bytes_;
-  msgpack::Value message_;  // over the bytes
+  msgpack::Value message_;  // refers to `bytes_`
   Extension extension_;
   OmniKeys omni_;
   bool is_refused_ = false;

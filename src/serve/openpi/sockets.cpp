@@ -37,8 +37,8 @@ using asio::ip::tcp;
 using boost::system::error_code;
 
 constexpr std::size_t kMaxHeader = 8192;
-constexpr std::size_t kPiece = 256 << 10;  // bytes that are read at once
-// In seconds of this process: for the handshake, for a sign of life, before a ping asks for one, for the close.
+constexpr std::size_t kPiece = 256 << 10;  // maximum bytes of one read
+// Timeouts in sweeps, one per second: for the handshake, without a sign of life, before a ping, for the close.
 constexpr int kHandshakePatience = 10, kSilencePatience = 60, kPingAfter = 20, kClosePatience = 5;
 
 using Request = http::request<http::empty_body>;
@@ -53,8 +53,8 @@ Response plain(const Request& request, http::status status, std::string body) {
   return response;
 }
 
-/// A connection that is ended by the server reads over what the peer still sends, so that the peer gets the frame that
-/// says why: closing with bytes unread resets a TCP connection. The sweeps bound the time.
+/// When the server ends a connection, it reads and discards what the peer still sends, so that the peer gets the frame
+/// with the reason: closing with unread bytes resets a TCP connection. The sweeps bound the time.
 struct Socket : tcp::socket {
   explicit Socket(tcp::socket socket) : tcp::socket(std::move(socket)) {}
   std::array<char, 4096> unread;
@@ -72,7 +72,7 @@ struct ReadOver {
   }
 };
 
-/// Beast calls it when the close frame has left. Its own for a tcp::socket stops after the first bytes.
+/// Beast calls this once the close frame is sent. Beast's own version for a tcp::socket stops after the first bytes.
 template <class Handler>
 void async_teardown(beast::role_type, Socket& socket, Handler&& handler) {
   error_code ignored;
@@ -149,7 +149,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     bool is_text;
   };
 
-  /// No memory on the way costs this connection only.
+  /// Runs a step. An exception, such as for lack of memory, ends this connection only.
   template <class Step>
   void guard(Step step) {
     try {
@@ -165,7 +165,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
       return answer_http(plain(request, http::status::ok, "OK\n"));
     if (!websocket::is_upgrade(request))
       return answer_http(plain(request, http::status::upgrade_required, "a WebSocket is here, and /healthz\n"));
-    // A page in the browser of this machine may connect to it too, and says so.
+    // A web page in a browser on this machine could connect too; the browser then sends Origin.
     if (request.count(http::field::origin) != 0)
       return answer_http(plain(request, http::status::forbidden, "not for web pages\n"));
     const auto given = request[http::field::authorization];
@@ -193,7 +193,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     read();
   }
 
-  /// Reads also while a request is in work, so that pings are answered.
+  /// Reads also while a request is in progress, so that pings are answered.
   void read() {
     stream_.async_read_some(buffer_, kPiece, [self = shared_from_this()](error_code error, std::size_t) {
       if (error == websocket::error::message_too_big)
@@ -212,7 +212,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     is_waiting_ = true;
     next();
   }
-  /// The message that came whole, where none is in work.
+  /// Handles the complete message, unless another one is in progress.
   void next() {
     if (!is_waiting_ || is_busy_ || is_failed_) return;
     is_waiting_ = false;
@@ -221,7 +221,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     const auto data = buffer_.data();
     std::string message(static_cast<const char*>(data.data()), data.size());
     buffer_.consume(buffer_.size());
-    if (buffer_.capacity() > 2 * kPiece) buffer_.shrink_to_fit();  // of a large message
+    if (buffer_.capacity() > 2 * kPiece) buffer_.shrink_to_fit();  // frees the buffer of a large message
     hold(0);
     shared_.handler->received(peer_, std::move(message), stream_.got_text());
     if (!is_closed_) read();
@@ -245,7 +245,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     is_busy_ = false;
     peer_.total_ms = std::chrono::duration<double, std::milli>(shared_.loop.now() - served_).count();
   }
-  /// Code and reason of the reference.
+  /// Closes with the reference's code and reason.
   void end() {
     is_ending_ = true;
     silent_ = 0;
@@ -268,14 +268,14 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
   Shared& shared_;
   Peer peer_;
-  const std::string group_;  // of its address
+  const std::string group_;  // group of the peer's address
   websocket::stream<Socket> stream_;
   beast::flat_buffer buffer_;  // the header, then the message that is being received or that waits
   http::request_parser<http::empty_body> parser_;
   Response response_;
-  std::deque<Out> out_;  // the first one is on its way
+  std::deque<Out> out_;  // the first one is being sent
   Clock::time_point began_ = peer_.since, served_ = {};
-  int age_ = 0, silent_ = 0;  // sweeps: since it came, since a sign of life
+  int age_ = 0, silent_ = 0;  // sweeps since it connected, since a sign of life
   std::size_t n_held_ = 0;
   bool is_open_ = false, is_greeted_ = false, is_busy_ = false, is_waiting_ = false;
   bool is_failed_ = false, is_ending_ = false, is_closed_ = false, is_pinging_ = false;
@@ -331,7 +331,7 @@ void Sockets::fail(std::uint64_t connection, std::string text) {
 }
 void Sockets::drop(std::uint64_t connection) noexcept try {
   if (const auto found = all_->find(connection)) found->drop("memory", "none for its request");
-} catch (const std::exception&) {  // it was told as far as it could be
+} catch (const std::exception&) {  // no memory to report it
 }
 bool Sockets::has_answers() const { return all_->has_answers(); }
 

@@ -23,7 +23,7 @@ struct Peer {
 };
 
 /// WebSocket connections at one address, and HTTP's `/healthz`. Everything runs inside the loop's `wait`, which never
-/// blocks on a peer. A connection has one request in work; one later message waits in memory. Pings are always
+/// blocks on a peer. A connection has one request in progress; one later message waits in memory. Pings are always
 /// answered.
 class Sockets {
  public:

@@ -18,7 +18,7 @@ CpuRun run_of(const CpuLowering& l, const CpuOp&, const BlockedOp& blocked) {
     task->kernel[i] = &kernel_of(l, *linear.linears[0]), task->job[i] = job_of(l, blocked.products[i], linear);
     note_uses(linear, task->job[i], uses);
   }
-  // A thread's scratch memory: that of the kernels, then the intermediate elements of its block.
+  // A thread's scratch memory holds the kernels' own scratch, then the intermediate elements of its block.
   const Value& inner = l.value(blocked.products[0].writes[0]);
   const std::int64_t d = inner.shape[0], n_square = kernels::ceil_div(rows_of(inner.shape), kernels::kTileSide);
   const std::int64_t n_row = kernels::ceil_div(n_square, blocked.n_block) * kernels::kTileSide;

@@ -24,7 +24,7 @@ std::unique_ptr<Task> embed(const CpuLowering& l, const Param* param, const std:
   });
 }
 
-/// Rows of a value.
+/// Copies rows of a value.
 std::unique_ptr<Task> gather(const CpuLowering& l, ValueId table, const std::int32_t* ids, float* y, std::int64_t d,
                              std::int64_t n) {
   const RowItems items(l, n, d);

@@ -12,7 +12,7 @@ struct RowCalls {
   float* y;
   Shape shape, x_stride, w_stride = {};
   float s = 0;
-  bool w_is_scalar = false;  // of each row
+  bool w_is_scalar = false;  // one element of w per row
 
   void operator()(std::int64_t row) const {
     const std::int64_t i = row % shape[1], j = row / shape[1] % shape[2], k = row / shape[1] / shape[2];

@@ -35,7 +35,7 @@ cuda::Int8Shape int8_shape(ProductShape shape) {
                                          : cuda::Int8Shape::rows128;
 }
 
-/// gate: of a gated product the matrix that the same kernel multiplies, or null.
+/// gate: the gate product, if the same kernel computes it with this one; else null.
 void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const CudaWeight& matrix, const Param& weight,
                  const cuda::Epilogue& end, const op::Linear* gate, Calls& calls) {
   const Value& x = l.value(of);
