@@ -10,6 +10,7 @@
 #include <cstdlib>
 #include <filesystem>
 #include <fstream>
+#include <map>
 
 #include "bundle/gguf_writer.h"
 
@@ -71,6 +72,23 @@ std::string golden_path(const std::string& name) {
     std::_Exit(1);
   }
   return path;
+}
+
+std::vector<std::string> golden_bundles() {
+  std::map<std::string, std::pair<std::uintmax_t, std::string>> smallest;  // by folder
+  for (const auto& arch : std::filesystem::directory_iterator(golden_path())) {
+    if (!arch.is_directory()) continue;
+    for (const auto& name : std::filesystem::directory_iterator(arch.path())) {
+      const auto bundle = name.path() / "bundle.gguf";
+      if (!std::filesystem::exists(bundle)) continue;
+      const std::pair found(std::filesystem::file_size(bundle), bundle.string());
+      const auto [kept, is_new] = smallest.emplace(arch.path(), found);
+      if (!is_new) kept->second = std::min(kept->second, found);
+    }
+  }
+  std::vector<std::string> paths;
+  for (const auto& [folder, bundle] : smallest) paths.push_back(bundle.second);
+  return paths;
 }
 
 std::string scratch_path(const std::string& file_name) {

@@ -39,6 +39,8 @@ std::string source_path(const std::string& path);
 /// The folder of a golden case, `arch/name`, with its checkpoint and bundle; of all cases without a name. The first
 /// call makes what is not there yet (tools/goldens).
 std::string golden_path(const std::string& name = "");
+/// The smallest golden bundle of each architecture.
+std::vector<std::string> golden_bundles();
 /// A place for files that a test writes.
 std::string scratch_path(const std::string& file_name);
 std::string write_file(const std::string& file_name, const std::string& bytes);
