@@ -16,12 +16,6 @@ Result<RandomBundle> make_random(const Request& request, const Watcher& watcher)
   return RandomBundle::make(request.arch, entry.published(), random_sizes(request));
 }
 
-/// Checks the bundle first, since measuring the machine takes seconds. Errors: those of Bundle::open.
-Status check_bundle(const std::string& path) {
-  const Result<Bundle> found = Bundle::open(path);
-  return found ? Status() : Status(found.error());
-}
-
 Conditions conditions_of(const Engine& engine, const Workload& workload, int n_step) {
   const auto text = [&](const char* key) {
     return *engine.robot().bundle().keys().string(key);
@@ -37,6 +31,15 @@ Conditions conditions_of(const Engine& engine, const Workload& workload, int n_s
           .n_thread = engine.device().n_thread(),
           .kernels = engine.kernels(),
           .device = engine.device().name()};
+}
+
+/// The request's roofs, or those that it measures, whose memory no peak counts.
+Roofs roofs_of(const Request& request, const Device& device, const char* task, const Watcher& watcher) {
+  if (request.roofs) return *request.roofs;
+  watcher.tell(task);
+  const Roofs roofs = measure_roofs(device.n_thread());
+  forget_peak_memory();
+  return roofs;
 }
 
 /// Runs the rounds for every number of solver steps.
@@ -64,7 +67,6 @@ RandomSizes random_sizes(const Request& request) {
 
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
                        const Watcher& watcher) {
-  if (!request.bundle.empty()) VLA_CHECK(check_bundle(request.bundle));
   VLA_TRY(const std::unique_ptr<Device> device, open_device(request.n_thread, request.kernels, request.device));
   std::optional<RandomBundle> random;
   if (request.bundle.empty()) {
@@ -73,8 +75,6 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   }
   Report report;
   report.cpu = cpu_name();
-  watcher.tell("measuring what the machine can do");
-  report.before = measure_roofs(device->n_thread());
   forget_peak_memory();
   StageClock clock;
   Timing load;
@@ -93,12 +93,14 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   report.conditions = conditions_of(*engine, workload, steps.back());
   report.precision = precision_name(engine->precision()), report.arithmetic = engine->arithmetic();
   VLA_CHECK(accept(report.conditions));
+  const std::size_t load_peak = process_memory().peak;
+  report.before = roofs_of(request, *device, "measuring what the machine can do", watcher);
   VLA_TRY(const std::vector<Series> all, run_all(*engine, workload, steps, request, watcher));
   report.predicted = engine->memory();
   report.process = process_memory();
+  report.process.peak = std::max(report.process.peak, load_peak);
   report.budget = engine->budget(), report.n_cached = engine->robot().bundle().content()->n_cached();
-  watcher.tell("measuring what the machine can do now");
-  report.after = measure_roofs(device->n_thread());
+  report.after = roofs_of(request, *device, "measuring what the machine can do now", watcher);
   summarize(all.back(), report);
   if (all.size() > 1) report.fit = fit_steps(all);
   return report;

@@ -18,13 +18,14 @@ struct Request {
   int n_thread = 0;  // see EngineOptions
   std::string kernels, device, embodiment;
   std::size_t memory = 0;
+  std::optional<Roofs> roofs;  // of the machine, if they are known
 };
 
 /// The sizes of a bundle of random weights.
 RandomSizes random_sizes(const Request& request);
 
-/// Measures the machine, the policy, and the machine again. `accept` gets the conditions before the first round and may
-/// refuse them. Errors: usage, out_of_memory, and those of Engine.
+/// Measures the machine, unless its roofs are known, then the policy, then the machine again. `accept` gets the
+/// conditions before all this and may refuse them. Errors: usage, out_of_memory, and those of Engine.
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
                        const Watcher& watcher);
 

@@ -72,7 +72,8 @@ Result<Machine> examine_machine() {
 
 int Checkup::replan_rows() const { return std::max(1, static_cast<int>(std::ceil(1e-3 * best() * rate_hz))); }
 
-Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, const Watcher& watcher) {
+Result<Checkup> examine_policy(Request request, const Machine& machine, const Watcher& watcher) {
+  request.roofs = machine.roofs;
   Checkup checkup;
   StagePredictions predicted;
   const bool on_cpu = request.device.empty() || request.device == "cpu";
@@ -86,6 +87,7 @@ Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, 
     checkup.predicted_memory = dry->memory().total();
     checkup.horizon = describe(*dry, dry->robot()).horizon;
     checkup.rate_hz = describe(*dry, dry->robot()).rate_hz;
+    const std::size_t free_memory = machine.free_memory;
     if (on_cpu && free_memory > 0 && checkup.predicted_memory > free_memory)
       return Error{Code::out_of_memory, request.bundle,
                    fmt::format("{:.1f} GB of free memory", 1e-9 * static_cast<double>(checkup.predicted_memory)),
@@ -103,9 +105,8 @@ Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, 
   checkup.cores = median_cores(checkup.report);
   add_stages(checkup, predicted);
   if (on_cpu && checkup.total < kFewMs && checkup.report.conditions.n_thread > 1) {
-    Request one = request;
-    one.n_thread = 1;
-    VLA_TRY(const Report report, measure(one, accept, watcher));
+    request.n_thread = 1;
+    VLA_TRY(const Report report, measure(request, accept, watcher));
     checkup.one_thread = report.find("total")->p50;
   }
   return checkup;

@@ -53,6 +53,6 @@ struct Checkup {
 /// Predicts from one phase of each kind (Engine::predict), also with int8 codes instead of floats, then loads the
 /// bundle and measures a few acts, also on one thread if an act takes less than a quarter of a second. Errors:
 /// out_of_memory, before loading, if the policy would not fit; those of `measure`.
-Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, const Watcher& watcher);
+Result<Checkup> examine_policy(Request request, const Machine& machine, const Watcher& watcher);
 
 }  // namespace vla::bench

@@ -142,7 +142,7 @@ Status doctor(const DoctorOptions& options) {
     request.embodiment = options.embodiment, request.n_thread = options.n_thread, request.n_round = 5;
     const bench::Watcher watcher = {[](const std::string& line) { say(stderr, "{}\n", line); },
                                     [] { return Status(); }};
-    const auto checkup = bench::examine_policy(request, machine.free_memory, watcher);
+    const auto checkup = bench::examine_policy(request, machine, watcher);
     if (!checkup) {
       root["refused"] = error_json(checkup.error());
       verdict = checkup.error();
