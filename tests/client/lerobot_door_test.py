@@ -24,8 +24,6 @@ from lerobot_calls import Peer, Robot  # noqa: E402
 from lerobot_pickles import TimedObservation, dumps, setup_of  # noqa: E402
 from server_process import SECONDS, VLA, frames  # noqa: E402
 
-pytestmark = pytest.mark.alone
-
 OTHER = "127.0.0.2"  # an address that is not the robots'
 DOOR = "vla-door-lerobot"
 CALL = "/transport.AsyncInference/GetActions"
@@ -152,6 +150,7 @@ def served(case):
         yield both
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("name", FLOODS)
 def test_a_flood_ends_its_connection_and_nothing_else(served, scene, name):
     with Robot(served[1]) as robot:
@@ -182,6 +181,7 @@ def test_a_connection_without_a_call_ends(served):
         assert 9 < time.monotonic() - start
 
 
+@pytest.mark.alone
 def test_three_hundred_short_connections_of_another_address_cost_a_robot_nothing(served, scene):
     """Half of them with a set-up: the robot's connection stays, and what it is."""
     door = served[1]
@@ -222,6 +222,7 @@ def test_a_monitor_without_a_setup_costs_a_robot_nothing(case, scene):
             assert refusal(robot, scene) is None
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("how, seconds", [(signal.SIGKILL, 2), (signal.SIGSEGV, 2), (signal.SIGSTOP, 4)])
 def test_a_process_that_ends_or_stops_is_started_again_and_native_robots_notice_nothing(case, scene, how, seconds):
     with serving(case, "--metrics", "127.0.0.1:0") as (server, door):
@@ -262,6 +263,7 @@ def test_the_process_ends_with_its_server(case):
         until(lambda: not Path(f"/proc/{pid}").exists())
 
 
+@pytest.mark.alone
 def test_a_server_stops_in_its_usual_time_while_the_process_is_stopped(case):
     with serving(case) as (server, _):  # its end is timed
         os.kill(doors(server.process.pid)[0], signal.SIGSTOP)
