@@ -34,7 +34,8 @@ constexpr std::size_t kMaxHeader = 4096;
 constexpr const char* kPolicy =
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; img-src blob:; "
     "frame-ancestors 'none'";
-constexpr auto kPatience = std::chrono::seconds(2);  // from accepting the connection to the last byte of the answer
+constexpr auto kRequestPatience =
+    std::chrono::seconds(2);  // from accepting the connection to the last byte of the answer
 
 struct Handlers {
   HttpHandler get, post;
@@ -48,7 +49,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   }
 
   void start() {
-    stream_.expires_after(kPatience);
+    stream_.expires_after(kRequestPatience);
     http::async_read_header(stream_, buffer_, parser_, [self = shared_from_this()](error_code error, std::size_t) {
       if (!error) self->answer();
     });

@@ -18,7 +18,7 @@
 namespace vla::observe {
 namespace {
 
-constexpr auto kPatience = std::chrono::seconds(2);  // at shutdown, for a pipe without a reader
+constexpr auto kDrainPatience = std::chrono::seconds(2);  // at shutdown, for a pipe without a reader
 constexpr int kPollMs = 100;
 
 }  // namespace
@@ -97,7 +97,7 @@ void Writer::run() {
 
 bool Writer::is_out_of_patience() const {
   const std::lock_guard lock(mutex_);
-  return closing_ && std::chrono::steady_clock::now() - closing_since_ > kPatience;
+  return closing_ && std::chrono::steady_clock::now() - closing_since_ > kDrainPatience;
 }
 
 /// A pipe that poll reports as writable takes PIPE_BUF bytes without blocking.
