@@ -105,9 +105,9 @@ def test_markdown_has_a_row_for_every_stage_and_an_earlier_run_is_compared_with(
     out = vla("bench", DEMO, *FEW, *same, "--markdown", "--vs", earlier).out
     rows = [line.split(" | ")[0] for line in out.splitlines() if line.startswith("| ")]
     assert rows == [f"| {name}" for name in ["stage", "---", *STAGES, "network", "total"]]
-    assert "times as fast" in out and "warning: the machine's own peak" in out
+    assert "times as fast" in out and "warning: the machine's own peak" in out and "budget" not in out
     other = vla("bench", DEMO, *FEW, "--steps", "1", "--vs", earlier)
-    assert other.code == 2 and other.out == ""
+    assert other.code == 2 and other.out == "" and "measuring" not in other.err
     assert all(part in other.err.splitlines()[-1] for part in ("error: usage: --vs", "1 steps", "found smolvla", "3 steps"))
 
 
@@ -151,3 +151,4 @@ def test_nonsense_is_refused_before_anything_is_measured(vla, arguments, found):
 def test_what_the_bundle_cannot_take_is_refused_with_what_it_can(vla, options, found):
     answer = vla("bench", DEMO, *options)
     assert answer.code in (2, 9) and answer.out == "" and found in answer.err.splitlines()[-1]
+    assert "measuring" not in answer.err
