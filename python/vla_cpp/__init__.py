@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Python side of vla.cpp.
 
-    Client   a policy at `vla serve`                Policy   the same in this process
-    OpenpiClient   one at a server of openpi's protocol
-    control  running chunks on a robot              convert  checkpoints into bundles (the extra `convert`)
+    Client         a policy at `vla serve`
+    OpenpiClient   a policy at a server that speaks openpi's protocol
+    Policy         a policy in this process
+    control        executing action chunks on a robot
+    convert        converting checkpoints into bundles (the extra `convert`)
 
-Names are imported when they are first used, so that each part needs only its own packages.
+Names are imported on first use, so that each part needs only its own packages.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""libvla.so by ctypes. Structs and functions are those of include/vla/vla.h, which documents them."""
+"""libvla.so by ctypes. include/vla/vla.h documents the structs and functions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IMAGE_ABSENT, IMAGE_RGB8, IMAGE_FILE = 1, 2, 3
 
 
 class _Struct(ctypes.Structure):
-    """A versioned struct: its size stands first and is set by the constructor."""
+    """A versioned struct: the first field is its size, which the constructor sets."""
 
     def __init__(self, **fields: object) -> None:
         super().__init__(ctypes.sizeof(self), **fields)
@@ -103,7 +103,7 @@ class Description(_Struct):
         ("real_time_chunking", c_char_p),
         ("embodiment", c_char_p),
         ("n_embodiment", c_size_t),
-        ("embodiments", POINTER(c_void_p)),  # of Description
+        ("embodiments", POINTER(c_void_p)),  # pointers to Description
         ("n_action_steps", c_size_t),
     ]
 
@@ -167,7 +167,7 @@ _FUNCTIONS = {
 
 
 def _candidates() -> list:
-    """Where the library may lie: as told, in this package (a wheel carries it), in the build of the source tree."""
+    """Paths to look for the library: VLA_LIBRARY alone if set; else this package (a wheel contains it) and the source tree's build."""
     told = os.environ.get("VLA_LIBRARY")
     if told:
         return [Path(told)]
@@ -177,7 +177,7 @@ def _candidates() -> list:
 
 @functools.lru_cache(maxsize=None)
 def load() -> ctypes.CDLL:
-    """The library, loaded once. Errors: IoError where there is none, Unsupported for one of another version."""
+    """Loads the library, once. Errors: IoError where there is none, Unsupported for one of another version."""
     candidates = _candidates()
     path = next((p for p in candidates if p.is_file()), None)
     if path is None:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a server answers, compared with what was asked and with what it said of its policy before: a robot moves by it.
+"""Checks a server's answer against the request and the policy's description before a robot executes it.
 
-Every client of this package hands out what `checked` returns, and nothing else.
+Every client of this package returns only chunks that `checked` has returned.
 """
 
 from __future__ import annotations
@@ -18,16 +18,20 @@ from .errors import BadAction, Incompatible
 from .printable import printable
 from .spec import Spec
 
-MAX_ANSWER = 16 << 20  # bytes, of any server
-# Beyond any joint in degrees, position in millimetres or count of an encoder that a policy commands: a note.
+MAX_ANSWER = 16 << 20  # bytes of an answer, from any server
+# A larger action gets a note: joints in degrees, positions in millimetres and encoder counts that a policy commands stay below.
 FAR_ACTION = 1e6
-MAX_ACTION = 2.0**32  # beyond what an encoder of 32 bits counts: refused
+MAX_ACTION = 2.0**32  # a larger action is refused: a 32-bit encoder counts no further
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What an answer must go with. spec: of the robot; seed, capture_time_ns: as sent, None where they were not; notes: of the
-    observation, which the answer gets."""
+    """The facts of a request that its answer must match.
+
+    spec                   the robot's spec
+    seed, capture_time_ns  as sent; None where they were not
+    notes                  notes about the observation, to be added to the answer's
+    """
 
     address: str
     spec: Spec
@@ -37,7 +41,7 @@ class Asked:
     notes: Tuple[str, ...] = ()
 
     def check(self, chunk: Chunk) -> Chunk:
-        """As `checked`, with the notes of the observation."""
+        """Checks the chunk with `checked` and adds the observation's notes."""
         return checked(self.address, chunk, self._facts(chunk), self.notes)
 
     def _facts(self, chunk: Chunk) -> Tuple[Tuple[str, Any, Any], ...]:
@@ -54,7 +58,7 @@ class Asked:
 
 
 def checked(address: str, chunk: Chunk, facts: Iterable[Tuple[str, Any, Any]], notes: Tuple[str, ...] = ()) -> Chunk:
-    """The chunk, with these notes and one for each column whose actions are far out.
+    """Checks the chunk and returns it with `notes` and a note for each column whose actions are beyond FAR_ACTION.
 
     facts  (what, expected, found): pairs that must be equal
 
@@ -77,7 +81,7 @@ def checked(address: str, chunk: Chunk, facts: Iterable[Tuple[str, Any, Any]], n
 
 
 def _far(actions: np.ndarray, names: Tuple[str, ...]) -> Tuple[str, ...]:
-    """One note for each column with a value that no robot is commanded."""
+    """One note for each column with a value beyond FAR_ACTION."""
     largest = np.abs(actions).max(axis=0)
     return tuple(
         f'action "{name}": {value:.3g}, beyond {FAR_ACTION:g}, which no unit of a robot explains'
@@ -87,7 +91,7 @@ def _far(actions: np.ndarray, names: Tuple[str, ...]) -> Tuple[str, ...]:
 
 
 def check_same_policy(address: str, known: Spec, found: Spec) -> None:
-    """A server that comes back may compute on another device, and its file have another name. Errors: Incompatible."""
+    """Refuses another policy after a reconnect. Device, kernels, precision and the bundle's file name may differ. Errors: Incompatible."""
     one, other = _interface(known), _interface(found)
     for name, value in one.items():
         if other[name] != value:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a policy answers to one observation."""
+"""A policy's answer to one observation."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Chunk:
     """Actions for the next `horizon` control steps; `np.asarray(chunk)` is float32 (horizon, d_action) in world units.
 
     names            one per column
-    normalized       the network's output before unnormalization, for a Leftover; None where the policy takes none
-    rate_hz          rows per second that the policy was trained for; 0 where the bundle does not say
+    normalized       the network's output before unnormalization, for a Leftover; None where the policy has no real-time chunking
+    rate_hz          rows per second in the training data; 0 where the bundle does not say
     timing           milliseconds per stage, in the order in which they ran
     queue_ms         milliseconds that the request waited at a server; 0 in process
     seed             of the noise; None where the noise was given
@@ -39,7 +39,7 @@ class Chunk:
     normalized: Optional[np.ndarray] = None
 
     def __array__(self, dtype=None, copy=None):
-        """NumPy's protocol, that of release 1 (no `copy`) and of release 2."""
+        """NumPy's array protocol, for NumPy 1 (without `copy`) and NumPy 2."""
         if dtype is not None and np.dtype(dtype) != self.actions.dtype:
             if copy is False:
                 raise ValueError(f"a chunk is {self.actions.dtype}; as {np.dtype(dtype)} it must be copied")

@@ -34,15 +34,16 @@ class Client(Handle):
             chunk = policy.act(images={"top": frame}, state=q, text="open the drawer")
 
     address             tcp://HOST:PORT or ipc://PATH
-    policy              its name, where the server has several. A client that names its policy goes on where another version takes its
-                        place (`vla ctl load`), which has the same views, states and actions; `chunk.bundle` tells which one answered
+    policy              name of the policy, where the server has several. A client that names its policy keeps working after
+                        `vla ctl load` replaces it by another version, which has the same views, states and actions; `chunk.bundle`
+                        says which version answered
     timeout             seconds that a call may take, connecting included
-    server_key          for a server with CURVE: its public key, and with it
+    server_key          public key of a server with CURVE, and
     secret_key          this client's secret key: 40 characters each, or the files of `vla keygen` (server.public, robot.secret)
-    absent              views that the robot does not have, as `["camera3"]`: no `act` needs to say so, and none may give an image of one
+    absent              views that the robot does not have, e.g. `["camera3"]`: no `act` needs to declare them, and none may give their image
 
-    The first call connects. When the server goes away, or does not answer in time, the call raises and the next one reconnects,
-    so that a program survives a restart of its server; a server that comes back with other weights is refused with Incompatible.
+    The first call connects. If the connection is lost or the server does not answer in time, the call raises and the next call
+    reconnects, so that a program survives a restart of its server. A restarted server with other weights is refused with Incompatible.
 
     Threads may share a client; their calls take turns. But a server keeps only the newest waiting observation of each client, so
     robots that act at the same time need a client each. A child process cannot use the client of its parent, nor can it be pickled.
@@ -69,7 +70,7 @@ class Client(Handle):
         self._context: Optional[zmq.Context] = zmq.Context()
         self._connection: Optional[Connection] = None
         self._pending: Dict[int, Pending] = {}
-        # Ids start anywhere, so that two clients, or two lives of one, hardly ever use the same.
+        # Request ids start at a random number, so that two clients, or two runs of one client, almost never use the same ids.
         self._last_id = random.SystemRandom().getrandbits(62)
         self._spec: Optional[Spec] = None
         self._limits: Any = None
@@ -84,12 +85,12 @@ class Client(Handle):
 
     @property
     def spec(self) -> Spec:
-        """What the policy takes and gives; asked for once. Errors: Timeout, Disconnected, Incompatible."""
+        """The policy's inputs and outputs, requested once. Errors: Timeout, Disconnected, Incompatible."""
         return self._spec or self._learn(self.timeout)
 
     @property
     def features(self) -> FrozenSet[str]:
-        """What the server can do beyond what every server can, as docs/protocol.md lists; empty before it has answered at all."""
+        """Optional capabilities of the server, listed in docs/protocol.md; empty before the server's first answer."""
         connection = self._connection
         return connection.features if connection else frozenset()
 
@@ -112,17 +113,18 @@ class Client(Handle):
         images           frames by view: uint8 (height, width, 3) RGB of any size, a Pillow image, the bytes of a JPEG or PNG file, or
                          None for a camera that the robot does not have
         state            world units: vectors by name, or one vector where the policy has one state
-        text             the instruction, as a person says it, which may be empty; None for a policy that reads none
-        seed, noise      where the solver starts: a number, or float32 (noise_rows, d_noise); with neither a seed is drawn, and the
-                         chunk tells it
-        leftover         real-time chunking: the rows of the chunk before that are not executed yet; see Leftover
-        deadline_ms      after so many milliseconds at the server the answer is worthless and not computed; the timeout by default
-        capture_time_ns  when the frames were taken; comes back in the chunk
+        text             the instruction in a person's words, which may be empty; None for a policy that reads none
+        seed, noise      the solver's noise: a seed, or float32 (noise_rows, d_noise); with neither a seed is drawn, which
+                         `chunk.seed` reports
+        leftover         real-time chunking: the rows of the previous chunk that are not executed yet; see Leftover
+        deadline_ms      milliseconds from the server's receipt of the request after which the answer is useless and not computed; by
+                         default the timeout
+        capture_time_ns  when the frames were taken; echoed in the chunk
         timeout          seconds, instead of the client's
         embodiment       tag of the robot, where `spec.robots` has several
 
-        Errors: BadObservation (what the policy cannot take, by name), Timeout, Disconnected, Superseded, Late, Busy, TooLarge,
-        Incompatible, ShuttingDown, and what the runtime itself may raise: BadAction, DeviceError, OutOfMemory, InternalError.
+        Errors: BadObservation (names the input that the policy cannot accept), Timeout, Disconnected, Superseded, Late, Busy, TooLarge,
+        Incompatible, ShuttingDown, and those of the runtime: BadAction, DeviceError, OutOfMemory, InternalError.
         """
         return self.submit(
             images=images, state=state, text=text, seed=seed, noise=noise, leftover=leftover,
@@ -140,9 +142,9 @@ class Client(Handle):
         loop: Optional[Mapping[str, Any]] = None,
         **observation: Any,
     ) -> Pending:
-        """Takes the arguments of `act`, sends them and returns at once: `done()` of the result never waits, `result()` is the chunk.
+        """Sends the observation (arguments as of `act`) and returns at once: `done()` of the result never waits, `result()` is the chunk.
 
-        `loop` has the fields of a LoopState (src/wire/vla.proto), which a ChunkLoop tells; they are sent where `features` have "loop".
+        `loop` has the fields of a LoopState (src/wire/vla.proto) and comes from a ChunkLoop; it is sent if `features` has "loop".
         Only the first call of a client may wait, for the description of the policy.
         """
         check_start(seed, noise)
@@ -167,11 +169,11 @@ class Client(Handle):
         return self._ask("chunk", timeout, write, asked, begun)
 
     def health(self, timeout: Optional[float] = None) -> Health:
-        """Answered also while the server computes. Errors: Timeout, Disconnected, Incompatible."""
+        """The server's state; answered also while the server computes. Errors: Timeout, Disconnected, Incompatible."""
         return self._ask("health", self.timeout if timeout is None else timeout, _health).result()
 
     def close(self) -> None:
-        """Ends the connection; requests under way end with Disconnected. A second call does nothing."""
+        """Closes the connection; pending requests end with Disconnected. A second call does nothing."""
         if os.getpid() != self._pid:
             return
         with self._lock:
@@ -181,13 +183,13 @@ class Client(Handle):
                 self._context = None
 
     def __del__(self) -> None:
-        if getattr(self, "_context", None) is not None and os is not None:  # modules are gone when the interpreter ends
+        if getattr(self, "_context", None) is not None and os is not None:  # `os` is None while the interpreter exits
             self.close()
 
     # --- requests and answers ------------------------------------------------------------------------------------------------
 
     def _learn(self, timeout: float) -> Spec:
-        """The description, for which threads may ask twice, so that none waits for another's timeout."""
+        """Requests the policy's description. Two threads may both request it, so that neither waits for the other's timeout."""
         description = self._ask("description", timeout, self._describe).result()
         with self._lock:
             if self._spec is None:
@@ -197,8 +199,14 @@ class Client(Handle):
     def _ask(
         self, kind: str, timeout: float, write: Callable[[Any], bytes], asked: Optional[Asked] = None, begun: Optional[float] = None
     ) -> Pending:
-        """Sends a request that `write` completes. kind: the field of the Response that answers it; asked: what a chunk must go with;
-        begun: when the caller's time began, where it was not now."""
+        """Sends a request.
+
+        kind     field of the Response that answers it
+        timeout  seconds
+        write    fills in the request and returns its bytes
+        asked    facts that the answering chunk must match
+        begun    time.monotonic() at which the timeout began; None: now
+        """
         with self._lock:
             connection = self._connect()
             request = self._new_request()
@@ -213,7 +221,7 @@ class Client(Handle):
         return wire.new_request(self._last_id)
 
     def _connect(self) -> Connection:
-        """A connection that is alive as far as one can know, greeted. Does not wait for anything."""
+        """The connection, newly made with a Hello if there is none or it was lost. Does not wait."""
         self._check_process()
         if self._context is None:
             raise Disconnected(self.address, "an open client", "one that was closed")
@@ -224,7 +232,7 @@ class Client(Handle):
             hello.hello.min_version = hello.hello.max_version = wire.PROTOCOL_VERSION
             hello.hello.client_name, hello.hello.client_version = "vla-cpp-python", __version__
             self._connection.send(hello.SerializeToString())
-            if self._spec is not None:  # the server may be another one by now
+            if self._spec is not None:  # checks that the server still has the same policy
                 self._connection.send(self._describe(self._new_request()))
         return self._connection
 
@@ -233,7 +241,7 @@ class Client(Handle):
             raise wrong_process(self, "use in a child process")
 
     def _settle(self, pending: Pending, seconds: float) -> bool:
-        """Whether the request is over, after waiting at most so long. Threads that wait take turns, in short slices."""
+        """Waits up to `seconds`, at most 0.05 s; whether the request is finished. Waiting threads take turns."""
         with self._lock:
             if not pending._is_over:
                 self._check_process()
@@ -242,12 +250,12 @@ class Client(Handle):
                 hint = "is the server up, and its address right? `health()` tells; or give more time"
                 pending._error = Timeout(self.address, f"an answer within {pending._timeout:g} s", "none", hint)
                 del self._pending[pending._id]
-                if not self._pending:  # a new socket for the next request: the host of this one may be down
+                if not self._pending:  # the host may be down: the next request gets a new socket
                     self._drop(pending._error)
             return pending._is_over
 
     def _pump(self, seconds: float) -> None:
-        """Takes what has come and hands it to those who asked."""
+        """Receives messages, waiting up to `seconds` for the first, and assigns them to their requests."""
         if self._connection is None:
             return
         try:
@@ -267,7 +275,7 @@ class Client(Handle):
         kind = response.WhichOneof("kind")
         error = wire.exception_of(response.error) if kind == "error" else None
         if isinstance(error, Incompatible) or (error and response.request_id == 0):
-            raise error  # the server could not read what it got, or never will: nothing else will be answered either
+            raise error  # the server cannot read this client's requests: no other request will be answered either
         if response.protocol_version != wire.PROTOCOL_VERSION:
             found = f"version {response.protocol_version}"
             raise Incompatible(self.address, f"answers of protocol version {wire.PROTOCOL_VERSION}", found)
@@ -278,7 +286,7 @@ class Client(Handle):
         if kind == "description" and self._spec is not None:
             check_same_policy(self.address, self._spec, wire.spec_of(response.description))
         pending = self._pending.pop(response.request_id, None)
-        if pending is None:  # to a greeting, or to a request that nobody waits for
+        if pending is None:  # the answer to a Hello, or to a request that timed out
             return
         try:
             if error:
@@ -303,7 +311,7 @@ class Client(Handle):
         if self.policy is None:
             expected, found = (f"{b.name} ({b.checksum})" for b in (self._spec.bundle, bundle))
             raise Incompatible(self.address, expected, found, "make a new Client, and read its spec")
-        self._spec = replace(self._spec, bundle=wire.bundle_of(bundle))  # the server sees to it that nothing else differs
+        self._spec = replace(self._spec, bundle=wire.bundle_of(bundle))  # the server ensures that nothing else differs
 
     def _describe(self, request: Any) -> bytes:
         request.describe.policy = self.policy or ""
@@ -311,7 +319,7 @@ class Client(Handle):
         return request.SerializeToString()
 
     def _drop(self, error: VlaError) -> None:
-        """Ends the connection, and with it every request under way."""
+        """Closes the connection; every pending request ends with `error`."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One connection to a server: a DEALER socket, and a monitor that reports when the server disconnects.
 
-A connection is never repaired. After a loss or a timeout it is closed and a fresh one made, so that nothing that was meant for an
-earlier request can come out of it.
+A connection is never reused after a loss or a timeout. It is closed and a new one is made, so that no answer to an earlier request
+can arrive on it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from zmq.utils.monitor import recv_monitor_message
 from .answer import MAX_ANSWER
 from .errors import Disconnected, UsageError
 
-HEARTBEAT_MS = 1000  # a server that is cut off, and so cannot say that it goes, is missed after three of these
+HEARTBEAT_MS = 1000  # a server that is cut off without a disconnect is noticed after three heartbeats
 RECONNECT_MS = 100
-MAX_WAITING = 8  # answers that wait to be read; a server that sends more waits
+MAX_WAITING = 8  # received answers that are not read yet; a server with more has to wait
 
 _REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 
 
 def curve_keys(server: Union[str, os.PathLike], secret: Union[str, os.PathLike]) -> Tuple[bytes, bytes, bytes]:
-    """What a connection takes, from keys or the files that hold them. Errors: UsageError, which does not show the key."""
+    """The argument `curve` of a Connection, from keys or key files. Errors: UsageError, which does not show the key."""
     server_key, secret_key = _key("server_key", server), _key("secret_key", secret)
     return server_key, zmq.curve_public(secret_key), secret_key
 
@@ -50,7 +50,7 @@ class Connection:
     def __init__(self, context: zmq.Context, address: str, curve: Optional[Tuple[bytes, bytes, bytes]]) -> None:
         """curve: the server's public key, our public key, our secret key. Errors: UsageError for an impossible address."""
         self._address = address
-        self.features: FrozenSet[str] = frozenset()  # of the server, once it has answered the greeting
+        self.features: FrozenSet[str] = frozenset()  # the server's, empty until it answers the Hello
         self._curve = bool(curve)
         self._socket = context.socket(zmq.DEALER)
         self._socket.linger = 0
@@ -72,20 +72,20 @@ class Connection:
             raise UsageError(address, "an address like tcp://127.0.0.1:5555", str(error)) from None
 
     def send(self, data: bytes) -> None:
-        """Never waits: without a connection yet, the socket queues the message. Errors: Disconnected for a full queue."""
+        """Sends without waiting: the socket queues the message until it is connected. Errors: Disconnected for a full queue."""
         try:
             self._socket.send(data, zmq.DONTWAIT, copy=False)
         except zmq.Again:
             raise Disconnected(self._address, "a server that reads", "a full queue", "ask less often") from None
 
     def receive(self, seconds: float) -> List[List[bytes]]:
-        """Waits for the first message at most so long, and returns it with others that have come. Errors: Disconnected.
+        """Waits up to `seconds` for a message and returns it with others that have arrived. Errors: Disconnected.
 
-        What arrived before the loss is returned first; the next call tells of the loss.
+        After a loss, messages that arrived before it are returned first; the next call raises Disconnected.
         """
         events = dict(self._poller.poll(max(0, math.ceil(seconds * 1000))))
         messages: List[List[bytes]] = []
-        while self._socket in events and len(messages) < MAX_WAITING:  # one that sends without end may not keep the caller
+        while self._socket in events and len(messages) < MAX_WAITING:  # a server that sends endlessly must not block the caller
             try:
                 messages.append(self._socket.recv_multipart(zmq.DONTWAIT))
             except zmq.Again:

@@ -1,21 +1,21 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every way in which a policy refuses, as one exception class per code.
+"""All errors of a policy: one exception class per error code.
 
-The codes and the four texts are those of the runtime (`src/base/result.h`); a server adds some of its own, and so does the client.
+The codes and the four texts are those of the runtime (`src/base/result.h`); server and client add codes of their own.
 """
 
 from __future__ import annotations
 
 
 class VlaError(Exception):
-    """What went wrong, for a person (`str(error)`) and for a program.
+    """An error, readable for a person (`str(error)`) and for a program.
 
-    code      the class of the problem, e.g. "bad_observation"
+    code      the error class, e.g. "bad_observation"
     where     file, feature or address
     expected  may be empty when `found` says it all
-    found     what was there instead, "nothing" for an empty text
-    hint      the next move, if there is one
+    found     what was found instead; "nothing" for an empty text
+    hint      what to do next, if known
     """
 
     code = "internal"
@@ -55,19 +55,19 @@ class BadBundle(VlaError):
 
 
 class BadObservation(VlaError):
-    """A frame, state, sentence or noise that the policy cannot take."""
+    """A frame, state, instruction or noise that the policy does not accept."""
 
     code = "bad_observation"
 
 
 class BadAction(VlaError):
-    """A number that is not finite came out, so there is no chunk."""
+    """The policy computed an invalid action, such as a number that is not finite, so there is no chunk."""
 
     code = "bad_action"
 
 
 class Unsupported(VlaError):
-    """Sound, but nothing that this build can do."""
+    """Valid, but not supported by this build."""
 
     code = "unsupported"
 
@@ -77,7 +77,7 @@ class OutOfMemory(VlaError):
 
 
 class DeviceError(VlaError):
-    """The device that computes failed."""
+    """The compute device failed."""
 
     code = "device"
 
@@ -89,13 +89,13 @@ class IoError(VlaError):
 
 
 class Superseded(VlaError):
-    """Server: a newer observation of the same client took this one's place in the queue."""
+    """Server: a newer observation of the same client replaced this one in the queue."""
 
     code = "superseded"
 
 
 class Late(VlaError):
-    """Server: the request's deadline passed before its turn came, or between two tokens of its answer, so it was not computed to its end."""
+    """Server: the request's deadline passed while it waited, or between two tokens of its answer; the answer was not completed."""
 
     code = "late"
 
@@ -113,19 +113,19 @@ class TooLarge(VlaError):
 
 
 class BadRequest(VlaError):
-    """Server: the bytes are no request of its schema; a fault of the client."""
+    """Server: the bytes are not a request of its schema; a fault of the client."""
 
     code = "bad_request"
 
 
 class Incompatible(VlaError):
-    """Server and client speak no common version of the protocol."""
+    """Server and client have no common protocol version, or an answer does not match its request or the policy."""
 
     code = "incompatible"
 
 
 class ShuttingDown(VlaError):
-    """Server: it is going down and takes no new requests."""
+    """Server: it is stopping and accepts no new requests."""
 
     code = "shutting_down"
 
@@ -158,5 +158,5 @@ _CLASSES = {
 
 
 def error_of(code: str, where: str, expected: str = "", found: str = "", hint: str = "") -> VlaError:
-    """The exception of a code; a code that this package does not know yet becomes a plain VlaError that carries it."""
+    """The exception for a code; an unknown code becomes a plain VlaError with that code."""
     return _CLASSES.get(code, VlaError)(where, expected, found, hint, code)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras that stopped: the same picture in one act after the other while the robot moves."""
+"""Detects frozen cameras: the same picture in consecutive acts while the robot moves."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from .errors import VlaError
 from .observation import Image, State, image_arg, states_of
 from .spec import Spec
 
-N_SAME = 5  # acts: a loop may be faster than its cameras, though not by so much
-MOVED = 1e-3  # a millimetre, or a twentieth of a degree in radians
+N_SAME = 5  # acts with one picture before a note; a control loop may be faster than its cameras, but hardly five times
+MOVED = 1e-3  # change of a state that counts as motion: a millimetre in metres, a twentieth of a degree in radians
 
 
 class CameraWatch:
-    """What one robot, or several by their tag, showed in the acts before."""
+    """The pictures and states of earlier acts, by robot and view."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._seen: Dict[Tuple[str, str], Tuple[bytes, np.ndarray, int]] = {}  # picture, state when it came, acts since
+        self._seen: Dict[Tuple[str, str], Tuple[bytes, np.ndarray, int]] = {}  # picture, state when it first appeared, acts since
 
     def notes(self, spec: Spec, images: Mapping[str, Image], state: State) -> Tuple[str, ...]:
-        """A note for each view whose picture stays the same to the byte although the state does not. An observation that the policy
-        cannot take is left to what refuses it."""
+        """A note for each view whose picture stays identical to the byte while the state changes. An invalid observation gets no notes
+        here; other checks refuse it."""
         try:
             pictures = {name: image_arg(name, image)[1] for name, image in images.items()}
             parts = states_of(state, spec.states)
@@ -43,7 +43,7 @@ class CameraWatch:
             )
 
     def _count(self, key: Tuple[str, str], picture: bytes, position: np.ndarray) -> int:
-        """Acts with this picture, 0 while the state is where it was when the picture came."""
+        """Number of acts with this picture, 0 while the state is the one of the picture's first act."""
         known, start, n = self._seen.get(key, (None, position, 0))
         if known != picture or start.shape != position.shape:
             start, n = position, 0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What `Client` and `Policy` have in common beside `act`."""
+"""The common part of `Client` and `Policy`, except `act`."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Self = TypeVar("Self", bound="Handle")
 
 
 class Handle:
-    """Is closed by its `with` block, and belongs to the process that made it."""
+    """A context manager that closes itself. Only the process that made it may use it."""
 
     def close(self) -> None:
         raise NotImplementedError
 
     def robot(self, embodiment: Optional[str]) -> Robot:
-        """One robot of a policy with several, as a policy of its own, e.g. for a ChunkLoop; None where there is one. Errors:
-        BadObservation, with the tags that there are."""
+        """One robot of a policy with several, as a policy of its own, e.g. for a ChunkLoop. `embodiment` is None if the policy has one
+        robot. Errors: BadObservation, which lists the tags."""
         return Robot(self, embodiment)
 
     def __enter__(self: Self) -> Self:
@@ -35,7 +35,7 @@ class Handle:
 
 
 class Robot:
-    """`spec`, `act` and, of a Client, `submit` of one robot."""
+    """`spec`, `act` and, for a Client, `submit`, bound to one robot."""
 
     def __init__(self, policy: Any, embodiment: Optional[str]) -> None:
         self.spec = robot_of(policy.spec, embodiment)

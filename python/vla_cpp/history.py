@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The moments of a policy that reads several, kept by the client: the runtime keeps no history, so that an act depends on its message alone."""
+"""Past observations for a policy that reads several moments. The client keeps them: in the runtime an act depends on its message alone."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ _BEFORE = re.compile(r"(.*)@-([1-9]\d*)")
 
 
 class History:
-    """Names what was seen k control steps ago NAME@-k, as the features of such a policy are called (Diffusion Policy).
+    """Keeps the last moments and names the feature of k control steps ago NAME@-k, as such a policy (Diffusion Policy) names it.
 
         history = vla_cpp.History(policy.spec)
         history.add(images, state)                 # at every control step
         chunk = policy.act(**history.observation)  # whenever rows are needed
 
-    Before the first step stands the first, as in LeRobot (policies/utils.py populate_queues). `reset()` begins an episode.
+    The first moment also fills the places of moments before it, as in LeRobot (policies/utils.py populate_queues). `reset()` begins
+    an episode.
     """
 
     def __init__(self, spec: Spec) -> None:
@@ -36,7 +37,7 @@ class History:
         self._moments.clear()
 
     def add(self, images: Mapping[str, Any], state: State) -> None:
-        """`images` and `state` of one moment, as `act` takes them of a policy that reads one."""
+        """Adds `images` and `state` of one moment, in the form that `act` accepts for a policy that reads a single moment."""
         if not isinstance(state, Mapping):
             if len(self._states) != 1:
                 raise BadObservation("state", "a dict of " + ", ".join(self._states), type(state).__name__)
@@ -46,7 +47,7 @@ class History:
 
     @property
     def observation(self) -> Dict[str, Dict[str, Any]]:
-        """`images` and `state` of all moments. Errors: BadObservation before the first `add`."""
+        """`images` and `state` of all moments, as arguments of `act`. Errors: BadObservation before the first `add`."""
         if not self._moments:
             raise BadObservation("history", "a moment or more", "none", "call add() with what is seen now")
         together: List[Dict[str, Any]] = [{}, {}]

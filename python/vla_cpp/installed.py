@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where this package lies, a source tree or an installation, and what to do there about what is missing."""
+"""Whether this package is in a source tree or installed, and how to install missing packages in either case."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parent
 
 
 def source_tree() -> Optional[Path]:
-    """The root of vla.cpp, None where the package was installed without it."""
+    """The root of vla.cpp; None for a package that is installed without the source tree."""
     root = PACKAGE.parents[1]
     return root if (root / "src/capi").is_dir() else None
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""msgpack messages with NumPy arrays, as openpi's protocol has them. Needs the extra `openpi`.
+"""msgpack messages with NumPy arrays, as in openpi's protocol. Needs the extra `openpi`.
 
-Whatever a peer sends is data: nothing of it is executed, and limits hold before memory or time is spent.
+A peer's message is only data: nothing is executed, and limits are checked before memory or time is spent.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ try:
 except ImportError as error:
     raise ImportError(f"{error}; {extra_hint('openpi')}") from error
 
-MAX_VALUES, MAX_DEPTH = 4096, 8  # of a message, as `vla serve` takes them
+MAX_VALUES, MAX_DEPTH = 4096, 8  # limits of a message, the same as in `vla serve`
 _DTYPE = re.compile(r"[<>|=]?(\?|[A-Za-z]{1,7}[0-9]{0,4})")
 
 
 def pack(value: Any) -> bytes:
-    """A message with NumPy arrays in it."""
+    """Packs a value that may contain NumPy arrays."""
     return msgpack.packb(value, default=_packed)
 
 
 def unpack(data: bytes, address: str, is_answer: bool = False) -> Any:
-    """A message, whose arrays are those of `pack` or of the package msgpack-numpy.
+    """Unpacks a message. Arrays may have the layout of `pack` or of the package msgpack-numpy.
 
-    address    where it came from
-    is_answer  its texts are to be shown and not computed with: what a terminal would obey becomes an escape
+    address    the sender, for errors
+    is_answer  the texts are only displayed: control characters in them are replaced by escapes
 
     Errors: Incompatible.
     """
@@ -47,7 +47,7 @@ def unpack(data: bytes, address: str, is_answer: bool = False) -> Any:
 
 
 class _Reader:
-    """Reads maps and lists itself, so that values are counted as they come; msgpack reads the rest."""
+    """Reads maps and lists itself, so that it can count values as it reads; msgpack reads the other values."""
 
     def __init__(self, data: bytes, is_answer: bool) -> None:
         self._data, self._is_answer = memoryview(data), is_answer
@@ -94,12 +94,12 @@ def _no_extension(code: int, data: bytes) -> Any:
 
 
 def _packed(value: Any) -> Any:
-    """An array as openpi's own client writes it."""
+    """An array in the layout of openpi's own client."""
     return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
 
 
 def _array(value: Dict[Any, Any]) -> Any:
-    """The array that a map stands for, in the layout of openpi or of msgpack-numpy, keys as bytes or text; else the map."""
+    """The array that a map represents in the layout of openpi or of msgpack-numpy, with keys as bytes or text; else the map itself."""
     fields = {key.decode("utf-8", "replace") if isinstance(key, bytes) else key: item for key, item in value.items()}
     if not {"__ndarray__", "__npgeneric__", "nd"} & set(fields):
         return value
@@ -117,7 +117,7 @@ def _array(value: Dict[Any, Any]) -> Any:
 
 
 def _dtype(name: Any) -> np.dtype:
-    """Of numbers of up to eight bytes, or of texts."""
+    """The dtype of that name. Errors: ValueError for other types than numbers of up to eight bytes and texts."""
     dtype = np.dtype(name) if isinstance(name, str) and _DTYPE.fullmatch(name) else None
     if dtype is None or dtype.kind not in "biufU" or (dtype.kind != "U" and dtype.itemsize > 8):
         raise ValueError(f"an array of {str(name)[:80]}")

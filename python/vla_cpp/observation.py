@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a caller may give as an observation: checked, and converted to one form."""
+"""Checks a caller's observation and converts it to one form."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ MAX_SEED = 2**64 - 1
 class Leftover:
     """Real-time chunking: the rows of the previous chunk that are not executed yet, which the next chunk continues.
 
-    rows          the last rows of its `normalized`
-    delay         how many of them will be executed when the next chunk arrives
-    schedule      of a guided policy (`Spec.real_time_chunking`), and only there: how the weight of the rows after the delay falls,
-                  "zeros", "ones", "linear" or "exp"
-    max_guidance  the same: the largest weight of the guidance
+    rows          the last rows of the previous chunk's `normalized`
+    delay         how many of them will have been executed when the next chunk arrives
+    schedule      only for a guided policy (`Spec.real_time_chunking`): how the weight of the rows after the delay falls, "zeros",
+                  "ones", "linear" or "exp"
+    max_guidance  only for a guided policy: the largest weight of the guidance
     """
 
     rows: object
@@ -36,14 +36,14 @@ class Leftover:
 
 
 def named(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
-    """The items of a dict by name."""
+    """The items of a dict whose keys are texts. Errors: BadObservation for anything else."""
     if not isinstance(mapping, Mapping) or not all(isinstance(name, str) for name in mapping):
         raise BadObservation(where, "a dict by name", "None" if mapping is None else type(mapping).__name__)
     return mapping.items()
 
 
 def robot_of(spec: Spec, embodiment: Optional[str]) -> Spec:
-    """What the robot of this tag takes; None where there is one. Errors: BadObservation, with the tags that there are."""
+    """The spec of the robot with this tag, which is None for a policy with one robot. Errors: BadObservation, which lists the tags."""
     tags = tuple(spec.robots) or ((spec.embodiment,) if spec.embodiment else ())
     if embodiment in tags:
         return spec.robots.get(embodiment, spec)
@@ -54,7 +54,7 @@ def robot_of(spec: Spec, embodiment: Optional[str]) -> Spec:
 
 
 def place(kind: str, given: str, features: Sequence[Union[ViewSpec, StateSpec]]) -> str:
-    """Where an error about what was given under this name is, as the runtime says it: the feature's full name, or `view "x"`."""
+    """The `where` of an error about a given name, as in the runtime: the feature's full name, or e.g. `view "x"` for an unknown one."""
     names = {f.name: (f.name, *getattr(f, "aliases", ())) for f in features}
     whole = [name for name, known in names.items() if given in known]
     part = [name for name, known in names.items() if given in (k.rsplit(".", 1)[-1] for k in known)]
@@ -63,7 +63,7 @@ def place(kind: str, given: str, features: Sequence[Union[ViewSpec, StateSpec]])
 
 
 def check_absent(absent: Sequence[str], spec: Spec) -> Tuple[str, ...]:
-    """The views that a robot does not have. Errors: UsageError for a name that is no view of the policy."""
+    """Checks the names of views that a robot does not have. Errors: UsageError for a name that is not a view of the policy."""
     views = [view for robot in ([*spec.robots.values()] or [spec]) for view in robot.views]
     for name in absent:
         if place("view", name, views) not in [view.name for view in views]:
@@ -72,7 +72,7 @@ def check_absent(absent: Sequence[str], spec: Spec) -> Tuple[str, ...]:
 
 
 def with_absent(images: Mapping[str, Image], absent: Sequence[str], views: Sequence[ViewSpec]) -> Mapping[str, Image]:
-    """The images, beside the views that are absent. Errors: BadObservation for an image of one of them."""
+    """The images plus None for each absent view. Errors: BadObservation for an image of an absent view."""
     if not absent:
         return images
     places = {place("view", name, views) for name in absent} & {view.name for view in views}
@@ -84,7 +84,7 @@ def with_absent(images: Mapping[str, Image], absent: Sequence[str], views: Seque
 
 
 def image_arg(where: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, None]]:
-    """("rgb", contiguous uint8 array (height, width, 3)), ("jpeg" or "png", the file's bytes), or ("absent", None)."""
+    """Checks an image: ("rgb", contiguous uint8 array (height, width, 3)), ("jpeg" or "png", the file's bytes), or ("absent", None)."""
     if image is None:
         return "absent", None
     if isinstance(image, (bytes, bytearray, memoryview)):
@@ -109,7 +109,7 @@ def image_arg(where: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, N
 
 
 def is_pillow(image: object) -> bool:
-    """Without importing Pillow, which need not be there."""
+    """Whether it is a Pillow image. Does not import Pillow, which may be missing."""
     return hasattr(image, "getbands") and hasattr(image, "mode")
 
 
@@ -134,7 +134,7 @@ def _of_floats(image: np.ndarray) -> str:
 
 
 def states_of(state: State, specs: Sequence[StateSpec]) -> Dict[str, np.ndarray]:
-    """Float32 vectors by name. One array stands for the only state of a policy."""
+    """Float32 vectors by name. A single array is the policy's only state."""
     if isinstance(state, Mapping):
         return {str(name): floats(place("state", str(name), specs), values, 1) for name, values in state.items()}
     if len(specs) != 1:
@@ -144,7 +144,7 @@ def states_of(state: State, specs: Sequence[StateSpec]) -> Dict[str, np.ndarray]
 
 
 def noise_of(noise: object, n_row: int, d_noise: int) -> np.ndarray:
-    """Float32 (n_row, d_noise); the reference's batch of one is taken off."""
+    """The noise as float32 (n_row, d_noise); a leading batch dimension of 1, as in the reference, is removed."""
     values = floats("noise", noise, 2)
     if values.shape != (n_row, d_noise):
         raise BadObservation("noise", f"shape ({n_row}, {d_noise})", str(values.shape))
@@ -152,7 +152,7 @@ def noise_of(noise: object, n_row: int, d_noise: int) -> np.ndarray:
 
 
 def leftover_of(leftover: Leftover, spec: Spec) -> np.ndarray:
-    """Its rows as float32 (row, d_action). What is left to check the runtime does, which knows the policy."""
+    """The leftover's rows as float32 (row, d_action). The runtime checks the other fields."""
     if not isinstance(leftover, Leftover):
         raise UsageError("leftover", "a Leftover", type(leftover).__name__)
     if not spec.real_time_chunking:
@@ -170,10 +170,10 @@ def leftover_of(leftover: Leftover, spec: Spec) -> np.ndarray:
 
 
 def floats(where: str, values: object, n_dim: int) -> np.ndarray:
-    """Float32 of `n_dim` dimensions, finite; a scalar is a vector of one, and a leading batch of one is taken off."""
+    """Finite float32 of `n_dim` dimensions; a scalar becomes a vector of one number, and a leading batch dimension of 1 is removed."""
     try:
         given = np.asarray(values)
-        # Text and objects would be parsed by the conversion: a number in quotes is a mistake of the caller.
+        # The conversion would parse text and objects, but a number in quotes is a mistake of the caller.
         if given.dtype.kind not in "fiub":
             raise TypeError
     except (TypeError, ValueError, RuntimeError):

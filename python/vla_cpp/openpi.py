@@ -26,26 +26,26 @@ from .websocket import WebSocket, WebSocketException
 
 MAX_RATE_HZ = 1e6
 _CODE = re.compile("[a-z_]{1,32}")
-TEXT = "text"  # what the key of the instruction stands for
+TEXT = "text"  # NAME in a line KEY=NAME whose key holds the instruction
 
 
 class OpenpiClient(Handle):
-    """Speaks with a policy server of openpi, or with `vla serve --openpi`.
+    """A client of an openpi policy server, or of `vla serve --openpi`.
 
         names = ["observation/image=top", "observation/wrist_image=wrist", "observation/state=arm", "prompt=text"]
         with OpenpiClient("openpi://127.0.0.1:8000", names) as policy:
             chunk = policy.act(images={"top": frame, "wrist": other}, state={"arm": q}, text="open the drawer")
 
     address   openpi://HOST:PORT, or a URL that begins with ws:// or wss://
-    names     KEY=NAME, a line for each key that the server takes: the name of an image or state of `act`, or `text` for the
-              instruction. Several lines of one key join their states. A key `images/X` is the member X of a map `images`
+    names     one text KEY=NAME for each key that the server expects: NAME is an image or state of `act`, or `text` for the
+              instruction. Several lines with the same key concatenate their states. The key `images/X` is the member X of a map `images`
     timeout   seconds that a call may take, connecting included
     api_key   sent as `Authorization: Api-Key ...`
 
-    metadata  what the server says of its policy when a connection begins: a dict, empty at many servers
+    metadata  the server's description of its policy, sent when a connection begins: a dict, empty for many servers
 
-    A connection that was lost, or that the server ended with an error, is made again by the next call: Incompatible where another
-    policy answers then. Threads take turns.
+    After a lost connection, or an error with which the server ended it, the next call reconnects, and raises Incompatible if the
+    server then has another policy. Threads take turns.
     Errors: UsageError, Disconnected, Timeout, Incompatible.
     """
 
@@ -63,7 +63,7 @@ class OpenpiClient(Handle):
         self._connection: Optional[WebSocket] = None
         self._is_closed = False
         self._said: Optional[_Said] = None
-        self._shape: Optional[Tuple[int, int]] = None  # of all chunks: what the server says, or else the first one's
+        self._shape: Optional[Tuple[int, int]] = None  # of every chunk: from the metadata, or else from the first chunk
         self.metadata: Dict[str, Any] = {}
         until = time.monotonic() + timeout
         with self._turn(until):
@@ -71,7 +71,7 @@ class OpenpiClient(Handle):
 
     @property
     def takes_seeds(self) -> bool:
-        """Whether a chunk can be asked for again: `vla serve` reads a seed, the protocol itself has none."""
+        """Whether a chunk can be reproduced from a seed: `vla serve` accepts a seed, openpi's protocol has none."""
         return str(self.metadata.get("server", "")).startswith("vla.cpp ")
 
     def act(
@@ -83,7 +83,7 @@ class OpenpiClient(Handle):
         seed: Optional[int] = None,
         timeout: Optional[float] = None,
     ) -> Chunk:
-        """One observation in, one action chunk out, in the units of the server.
+        """One observation in, one action chunk out, in the units that the server uses.
 
         images   frames by name: uint8 (height, width, 3) RGB, or a Pillow image
         state    vectors by name
@@ -91,8 +91,9 @@ class OpenpiClient(Handle):
         seed     of the noise, 0 to 2^63 - 1, where `takes_seeds`
         timeout  seconds, instead of the client's
 
-        Errors: BadObservation, TooLarge, Unsupported (a seed that the server cannot take), Timeout, Disconnected, Incompatible, and
-        what `vla serve` refuses as the classes of Client. What another server tells is a VlaError with the last line of it.
+        Errors: BadObservation, TooLarge, Unsupported (a seed for a server without seeds), Timeout, Disconnected, Incompatible; for
+        `vla serve` also the server's errors, with the same classes as in Client. An error of another server is a VlaError with the last
+        line of its text.
         """
         message = self._message(images, state, text)
         until = time.monotonic() + (self.timeout if timeout is None else timeout)
@@ -103,16 +104,16 @@ class OpenpiClient(Handle):
             try:
                 connection.send(pack(message), until)
                 answer = connection.receive(until)
-            except Exception as problem:  # a late answer must not be taken for that of the next call
+            except Exception as problem:  # the next call must not receive the late answer of this one
                 self._drop()
                 raise self._error_of(problem) from problem
             if isinstance(answer, str):
-                self._drop()  # the server ends the connection after it
+                self._drop()  # the server closes the connection after an error text
                 raise _refusal(self.address, answer)
             return self._chunk_of(unpack(answer, self.address, is_answer=True), seed)
 
     def close(self) -> None:
-        """Ends the connection. A second call does nothing."""
+        """Closes the connection. A second call does nothing."""
         with self._lock:
             self._is_closed = True
             self._drop()
@@ -159,7 +160,7 @@ class OpenpiClient(Handle):
         if self._is_closed:
             raise Disconnected(self.address, "an open client", "one that was closed")
         if self._connection is not None and not self._connection.is_silent():
-            self._drop()  # it was lost meanwhile, or what comes next would be no answer to what is asked
+            self._drop()  # the connection was lost, or holds a message that would be taken for the next answer
         if self._connection is None:
             try:
                 self._connection = WebSocket(self._url, self._headers, MAX_ANSWER, until)
@@ -171,7 +172,7 @@ class OpenpiClient(Handle):
         return self._connection
 
     def _greet(self, greeting: Any) -> None:
-        """Takes the metadata. Errors: Incompatible, also where another policy greets than before."""
+        """Reads the metadata. Errors: Incompatible, also if the policy differs from the one of the previous connection."""
         metadata = None if isinstance(greeting, str) else unpack(greeting, self.address, is_answer=True)
         if not isinstance(metadata, dict):
             raise Incompatible(self.address, "the metadata of an openpi server", type(metadata).__name__)
@@ -193,7 +194,7 @@ class OpenpiClient(Handle):
         return problem
 
     def _chunk_of(self, answer: Any, seed: Optional[int]) -> Chunk:
-        if isinstance(answer, dict) and answer.get("type") == "error":  # of servers that keep the connection
+        if isinstance(answer, dict) and answer.get("type") == "error":  # some servers keep the connection after an error
             raise _refusal(self.address, str(answer.get("message", "")))
         reply = answer if isinstance(answer, dict) else {"actions": answer}
         actions = reply.get("actions")
@@ -204,7 +205,7 @@ class OpenpiClient(Handle):
                 else printable(", ".join(map(str, reply))) or "nothing"
             )
             raise Incompatible(self.address, "`actions`, floats (horizon, d_action)", found)
-        with np.errstate(over="ignore"):  # infinity, which is refused
+        with np.errstate(over="ignore"):  # an overflow gives infinity, which `checked` refuses
             chunk = self._chunk(actions.astype(np.float32), reply)
         shape, width = chunk.actions.shape, chunk.actions.shape[1]
         facts = [("shape", self._shape or shape, shape), ("number of columns", len(chunk.names) or width, width)]
@@ -230,17 +231,17 @@ class OpenpiClient(Handle):
 
     @property
     def name(self) -> str:
-        """Of the policy's bundle where the server tells it, else the server's address."""
+        """Name of the policy's bundle if the server states it, else the server's address."""
         return str(self.metadata.get("bundle", self.address))
 
     @property
     def identity(self) -> str:
-        """The checksum of the weights where the server tells it, else its address."""
+        """Checksum of the weights if the server states it, else the server's address."""
         return str(self.metadata.get("checksum", self.address))
 
 
 def pairs_of(lines: Sequence[str]) -> List[Tuple[str, str]]:
-    """Lines KEY=NAME in two. Errors: UsageError."""
+    """Lines KEY=NAME as pairs (KEY, NAME). Errors: UsageError."""
     pairs = [(key, name) for key, _, name in (line.partition("=") for line in lines)]
     if not pairs or not all(key and name for key, name in pairs):
         raise UsageError(
@@ -256,7 +257,7 @@ def _frame(name: str, image: Any) -> np.ndarray:
 
 
 class _Said(NamedTuple):
-    """What a server's metadata says of its policy, and its answers must keep to. shape: None, names: empty, where it says nothing."""
+    """The policy's description in a server's metadata, which its answers must match. Unstated: shape is None, names are empty."""
 
     checksum: str
     names: Tuple[str, ...]
@@ -265,7 +266,7 @@ class _Said(NamedTuple):
 
 
 def _said(address: str, metadata: Mapping[str, Any]) -> _Said:
-    """Errors: Incompatible."""
+    """Reads the policy's description in the metadata. Errors: Incompatible."""
     names = _part(address, metadata, "action_names", list, [])
     if not all(isinstance(name, str) for name in names):
         raise Incompatible(address, "texts as `action_names`", "others")
@@ -278,7 +279,7 @@ def _said(address: str, metadata: Mapping[str, Any]) -> _Said:
 
 
 def _part(address: str, owner: Mapping[str, Any], key: str, kind: type, default: Any) -> Any:
-    """A member of an answer, of this type. Errors: Incompatible."""
+    """A member of an answer, checked to be of type `kind`; `default` if it is absent. Errors: Incompatible."""
     value = owner.get(key)
     if value is None:
         return default
@@ -288,7 +289,7 @@ def _part(address: str, owner: Mapping[str, Any], key: str, kind: type, default:
 
 
 def _number(address: str, owner: Mapping[str, Any], key: str, default: Optional[float]) -> Any:
-    """The same for a number. Errors: Incompatible, also where it is not finite."""
+    """A finite number of an answer; `default` if it is absent. Errors: Incompatible."""
     value = owner.get(key)
     if value is None:
         return default
@@ -298,7 +299,8 @@ def _number(address: str, owner: Mapping[str, Any], key: str, default: Optional[
 
 
 def _refusal(address: str, text: str) -> VlaError:
-    """`vla serve` puts its code first; others send a traceback, whose last line says what it was."""
+    """The exception for an error text. `vla serve` begins it with an error code; other servers send a traceback, whose last line
+    names the error."""
     code, _, rest = text.partition(": ")
     if _CODE.fullmatch(code):
         return error_of(code, address, found=printable(rest))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""How the programs write a file: as `write_file` of the runtime does (src/base/file.h)."""
+"""Output files of the programs, written with the rules of the runtime's `write_file` (src/base/file.h)."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ Path = Union[str, "os.PathLike[str]"]
 
 
 def open_file(path: Path) -> Optional[int]:
-    """The descriptor that a path such as /dev/stdout or /dev/fd/3 stands for, whatever it leads to; None for other paths."""
+    """The file descriptor that a path such as /dev/stdout or /dev/fd/3 names; None for other paths."""
     found = re.fullmatch(r"/(?:dev|proc/self)/fd/(\d+)", os.fspath(path))
     return int(found[1]) if found else OPEN_FILES.get(os.fspath(path))
 
 
 def is_special(path: Path) -> bool:
-    """Whether `path` is written to as it is: a pipe, a device or an open file."""
+    """Whether `path` is written in place, without a temporary file: a pipe, a device or an open file."""
     return open_file(path) is not None or (os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path))
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file that writing to `path` would replace."""
+    """Whether writing to `path` would replace a file."""
     return open_file(path) is None and os.path.isfile(path)
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write to in any order, which becomes `path` when the block ends and is gone when it raises.
+    """A temporary file, writable in any order, that becomes `path` when the block ends and is removed when the block raises.
 
-    Its `name` is a path beside `path`, for a library that opens the file itself. It takes the mode of a file that it replaces. Links are
-    followed, and stay. What is no regular file, such as a pipe or a device, and an open file such as /dev/stdout get the bytes when all of
-    them are made. Errors: OSError.
+    Its `name` is a path beside `path`, for a library that opens the file itself. It gets the mode of the file that it replaces. A link is
+    followed and kept. A pipe, a device, and an open file such as /dev/stdout receive the bytes when the block ends; the temporary file is
+    then in the system's folder for those. Errors: OSError.
     """
     path, in_place = os.fspath(path), is_special(path)
     target = os.path.realpath(path)
-    mode = os.stat(target).st_mode if os.path.lexists(target) else None  # a link that leads to itself has none: OSError
+    mode = os.stat(target).st_mode if os.path.lexists(target) else None  # OSError for a link that leads to itself
     if not in_place and stat.S_ISDIR(mode or 0):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), path)
     part = "{}.{}.part".format(os.path.join(tempfile.gettempdir(), "vla") if in_place else target, secrets.token_hex(4))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a client gives back: answers that are under way, and how the server is."""
+"""Results of a client: pending answers, and the state of the server."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Health:
-    """How the server is. uptime_s: seconds since it became ready. queue_depth: acts that wait, beside one that is computed."""
+    """The server's state. uptime_s: seconds since it became ready. queue_depth: waiting acts, without the one that is computed."""
 
     ready: bool
     queue_depth: int
@@ -28,7 +28,7 @@ class Health:
 
 
 class Pending:
-    """An answer that is under way."""
+    """A pending answer."""
 
     def __init__(
         self, client: Client, request_id: int, kind: str, timeout: float, asked: Optional[Asked], begun: Optional[float]
@@ -39,11 +39,11 @@ class Pending:
         self._error: Optional[VlaError] = None
 
     def done(self) -> bool:
-        """Whether `result` would return, or raise, at once. Never waits."""
+        """Whether `result` would return or raise immediately. Never waits."""
         return self._client._settle(self, 0.0)
 
     def result(self) -> Any:
-        """Waits for the answer, until the timeout that the request was made with. Errors: as `Client.act`."""
+        """Waits for the answer, up to the request's timeout. Errors: those of `Client.act`."""
         while not self._client._settle(self, self._until - time.monotonic()):
             pass
         if self._error:

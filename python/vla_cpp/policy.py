@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A policy in this process: no server, no copy on a wire, the same methods as `Client`."""
+"""A policy in this process, without a server: `spec`, `robot`, `act` and `close` as in `Client`."""
 
 from __future__ import annotations
 
@@ -29,21 +29,23 @@ class Policy(Handle):
         with vla_cpp.Policy("policy.gguf") as policy:
             chunk = policy.act(images={"top": frame}, state=q, text="open the drawer")
 
-    path     a bundle that vla-convert made
-    threads  of the CPU; 0 takes every core that the process may use
-    kernels  "ggml", "portable", "neon", "neon_bf16", "avx2", "avx512", "avx512_bf16", "amx", or "float32": the best that does not round to bf16,
-             or "bf16": the best that does, with large matrices rounded to it, "int8" or "int4": the best, with large matrices quantized, smaller and less exact;
-             None: on the CPU the best for the bundle's dtype.
-             Other devices take "float32", as None does, and "bf16"
-    strict_state  refuse a state far beyond what the policy has seen (BadObservation) instead of answering with a note
-    device   "cpu", "vulkan", "vulkan:1", "cuda", ...; None: "cpu". A device that is absent is a DeviceError, which lists what is there
-    embodiment  of a bundle for several robots, the tag of the one to load; None: all of them, and each `act` names its robot
-    absent   views that the robot does not have, as `["camera3"]`: no `act` needs to say so, and none may give an image of one
-    memory   bytes that the process may take, or on a GPU the policy of its memory; 0: no limit. Matrices that do not fit stay in
-             the file and are read in every act; actions are the same to the bit. Too few are an OutOfMemory that tells how many would do
+    path     a bundle, as vla-convert makes it
+    threads  number of CPU threads; 0: every core that the process may use
+    kernels  "ggml", "portable", "neon", "neon_bf16", "avx2", "avx512", "avx512_bf16" or "amx"; "float32": the best that does not round to
+             bf16; "bf16": the best that does, with large matrices rounded to bf16; "int8" or "int4": the best, with large matrices
+             quantized, smaller and less exact. None: on the CPU the best for the bundle's dtype.
+             Vulkan accepts None, "ggml" and "float32", which are the same, and "bf16". CUDA accepts None (matrices as they are stored),
+             "float32", "bf16", "int8" and "int4" (large matrices converted), and "ggml"
+    strict_state  refuse a state far outside the range of the training data (BadObservation) instead of answering with a note
+    device   "cpu", "vulkan", "vulkan:1", "cuda", ...; None: "cpu". An absent device is a DeviceError, which lists the devices present
+    embodiment  for a bundle for several robots: tag of the robot to load; None: all robots, and each `act` names its robot
+    absent   views that the robot does not have, e.g. `["camera3"]`: no `act` needs to declare them, and none may give their image
+    memory   limit in bytes of the process's memory, or on a GPU of the policy's GPU memory; 0: no limit. Matrices that do not fit stay in
+             the file and are read in every act; actions are the same to the bit. A limit that is too low is an OutOfMemory, which says how
+             many bytes suffice
 
-    Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use the policy
-    of its parent, since the threads that compute stay behind, nor can it be pickled.
+    Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use its parent's
+    policy, since it does not inherit the compute threads. A policy cannot be pickled.
 
     Errors: IoError, BadBundle, Unsupported, OutOfMemory, DeviceError, UsageError.
     """
@@ -84,7 +86,7 @@ class Policy(Handle):
 
     @property
     def spec(self) -> Spec:
-        """What the policy takes and gives."""
+        """The policy's inputs and outputs."""
         return self._spec
 
     def act(
@@ -101,7 +103,7 @@ class Policy(Handle):
     ) -> Chunk:
         """One observation in, one action chunk out. The arguments are those of `Client.act`.
 
-        Errors: BadObservation (what the policy cannot take, by name), BadAction, DeviceError, OutOfMemory, InternalError.
+        Errors: BadObservation (names the input that the policy cannot accept), BadAction, DeviceError, OutOfMemory, InternalError.
         """
         check_start(seed, noise)
         if noise is None and seed is None:
@@ -121,7 +123,7 @@ class Policy(Handle):
             self._library.vla_chunk_close(answer)
 
     def close(self) -> None:
-        """Frees the policy, after a call that is under way. A second call does nothing."""
+        """Frees the policy, after waiting for a running call. A second call does nothing."""
         if os.getpid() != self._pid:
             return
         with self._lock:
@@ -129,7 +131,7 @@ class Policy(Handle):
             self._handle = ctypes.c_void_p()
 
     def __del__(self) -> None:
-        if getattr(self, "_library", None) is not None and os is not None:  # modules are gone when the interpreter ends
+        if getattr(self, "_library", None) is not None and os is not None:  # `os` is None while the interpreter exits
             self.close()
 
     def _check_usable(self) -> None:
@@ -163,7 +165,7 @@ class Policy(Handle):
 
 
 class _Call:
-    """An observation as the library reads it, together with the arrays that it points into."""
+    """An observation as a struct of the library, together with the arrays that the struct points into."""
 
     def __init__(
         self,
@@ -234,7 +236,7 @@ def _encoded(where: str, text: object, refusal: Type[VlaError]) -> bytes:
 
 
 def _name_of(where: str, name: object) -> bytes:
-    """A name without a NUL, at which the library would take it to end."""
+    """A name in UTF-8. Refuses a NUL, at which the library would cut the name."""
     data = _encoded(where, name, BadObservation)
     if b"\0" in data:
         raise BadObservation(where, "a name", repr(name)[:80])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Text that comes from a file or a peer, made fit for a terminal and a log."""
+"""Makes text from a file or a peer safe for a terminal and a log."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ MAX_LENGTH = 4000  # characters of one text
 
 
 def printable(text: str) -> str:
-    """One line: escape sequences, line ends and marks that turn the direction of writing are shown as escapes, never sent."""
+    """The text in one line: control characters, line ends and marks of writing direction are replaced by visible escapes."""
     shown = text if len(text) <= MAX_LENGTH else text[:MAX_LENGTH] + "..."
     return shown if shown.isprintable() else "".join(c if c.isprintable() else _escaped(c) for c in shown)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""`vla`, as pip puts it on the PATH: the program that a wheel carries takes this process over."""
+"""The command `vla` that pip installs: it replaces this process by the program in the wheel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .installed import PACKAGE, source_tree
 
 
 def candidates() -> List[Path]:
-    """Where the program may be, best first."""
+    """Paths to look for the program, in order of preference."""
     root = source_tree()
     return [PACKAGE / "bin/vla", *([root / "build/cpu/bin/vla"] if root else [])]
 

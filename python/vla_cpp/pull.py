@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""vla-pull: bundles of the hub, into the cache of huggingface_hub, from which every command takes them by name.
+"""vla-pull: downloads bundles from the hub into the cache of huggingface_hub. Every command finds them there by name.
 
-What was cut off, also by a kill, is continued by the next run. A file is kept under its SHA-256, which is checked at every run, and at every
-load the bundle's own checksum is.
+The next run continues an interrupted download. A file is stored under its SHA-256, which every run checks; every load checks the bundle's own
+checksum.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ Exit codes: 0 done, 2 usage, 9 a file or the hub."""
 
 
 def pull(source: str) -> List[Path]:
-    """The bundles of a repository, downloaded where they are not yet. Errors: ConvertError (form, hub, other bytes), IoError (none)."""
+    """Paths of a repository's bundles, downloaded if missing. Errors: UsageError and ConvertError (form of the name, hub, damaged bytes),
+    IoError (no bundle)."""
     folder = hub_folder(source, [PATTERN], again=True)
     if folder is None:
         raise UsageError(source, HUB_FORM, "another form")
@@ -39,7 +40,7 @@ def pull(source: str) -> List[Path]:
 
 
 def _bundles() -> Iterator[Tuple[str, Any, Any]]:
-    """(name, repository, revision) of everything in the cache that has a bundle."""
+    """(name, repository, revision) of every cached revision with a bundle."""
     from huggingface_hub import scan_cache_dir
     from huggingface_hub.errors import CacheNotFound
 
@@ -61,7 +62,7 @@ def show() -> None:
 
 
 def remove(source: str) -> None:
-    """Errors: IoError, with what there is."""
+    """Deletes a cached revision. Errors: IoError for an unknown name, listing the known ones."""
     from huggingface_hub import scan_cache_dir
 
     names = {name: revision for name, _, revision in _bundles()}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What `vla serve --record` wrote, read back. src/observe/recording.h describes the file."""
+"""Reads recordings of `vla serve --record`. src/observe/recording.h describes the file."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from .observation import place, robot_of
 from .spec import Spec
 
 FILE = "requests.vlarec"
-_LATEST_NS = 4_102_444_800 * 10**9  # 2100; what programs count in nanoseconds from 1970 has to end somewhere
-_LONGEST_MS = 1e9  # from a receipt to its answer
+_LATEST_NS = 4_102_444_800 * 10**9  # the year 2100; a later time of receipt is damage
+_LONGEST_MS = 1e9  # most milliseconds from receipt to answer
 _MAGIC = b"VLAREC2\n"
 _HEAD, _SEAL = struct.Struct("<4sIIIQQ"), struct.Struct("<Q")
 
 
 @dataclass(frozen=True)
 class Record:
-    """A request and its answer, as they went over the wire.
+    """A request and its answer as bytes of the wire protocol.
 
-    index        from 1; 0 is the server's description
-    client       tells connections apart
-    received_ns  when the request came, since 1970
+    index        number of the record, from 1; 0 is the server's description
+    client       id of the connection
+    received_ns  when the request was received, in nanoseconds since 1970
     """
 
     index: int
@@ -44,12 +44,12 @@ class Record:
 
 
 class Recording:
-    """A recording, record by record. Errors: IoError (no such file), BadRequest (damaged, with the place)."""
+    """Iterates over the records of a recording. Errors: IoError (no such file), BadRequest (damaged, with the place)."""
 
     def __init__(self, folder: Path) -> None:
         self.path = Path(folder) / FILE
-        self.is_whole = False  # whether the end that was reached is the one that the server wrote
-        if not self.path.is_file():  # a pipe would be waited for
+        self.is_whole = False  # whether reading has reached the end mark that the server wrote
+        if not self.path.is_file():  # opening a pipe would wait
             raise IoError(str(self.path), "a recording of vla serve --record", "no file that can be read")
         for record in self._records():
             self.spec = self._described(record)
@@ -117,13 +117,13 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class RecordedAct:
-    """An observation and what the server answered.
+    """An observation and the server's answer.
 
-    spec    of the robot that the observation is of
+    spec    spec of the observed robot
     images  by full name: (kind, data), "jpeg" or "png" with the file's bytes, or "rgb" with uint8 (height, width, 3);
             views that the robot does not have are left out
     states  by full name, float32 in world units
-    answer  the chunk, or why there is none
+    answer  the Chunk, or the VlaError if there is none
     """
 
     record: Record
@@ -135,7 +135,7 @@ class RecordedAct:
 
     @property
     def ready_ns(self) -> int:
-        """When the answer was there, since 1970."""
+        """When the answer was ready, in nanoseconds since 1970; the time of receipt if it is an error."""
         took_ms = _took_ms(self.answer) if isinstance(self.answer, Chunk) else 0
         return self.record.received_ns + int(took_ms * 1e6)
 
@@ -145,13 +145,13 @@ def _took_ms(chunk: Chunk) -> float:
 
 
 def acts_of(recording: Recording, first: Optional[int] = None) -> Iterator[RecordedAct]:
-    """The acts among the first so many records. What was refused has no images and states, as they may be what was wrong.
-    Errors: BadRequest (an act and an answer that do not go together)."""
+    """The acts among the first `first` records, or among all. A refused act has no images and states, since they may be the invalid part.
+    Errors: BadRequest (an act and an answer that do not match)."""
     for record in islice(recording, first):
         try:
             request = wire.Request.FromString(record.request)
             response = wire.Response.FromString(record.response)
-        except DecodeError:  # what was no request was answered with an error, and recorded too
+        except DecodeError:  # a message that is not a request is recorded too, with the error that answered it
             continue
         if request.WhichOneof("kind") != "act":
             continue

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a policy takes and gives, as its bundle says it."""
+"""A policy's inputs and outputs, as stated in its bundle."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ from .printable import printable
 
 @dataclass(frozen=True)
 class ViewSpec:
-    """A camera. width, height: pixels that the network sees; frames of any size are letterboxed to it. camera: width and height of the
-    frames that the checkpoint states, 0 where it states none or `Policy` describes it: views are equal without it."""
+    """A camera.
+
+    width, height  pixels of the network's input; frames of any size are fitted into it
+    camera         width and height of the camera frames that the checkpoint states; 0 where it states none, and always 0 from `Policy`.
+                   Not compared by `==`
+    """
 
     name: str
     optional: bool
@@ -27,7 +31,7 @@ class ViewSpec:
 class StateSpec:
     """A state vector of `width` numbers.
 
-    units, names: one text per number, empty where the bundle does not say; never guessed
+    units, names  one text per number, empty where the bundle does not state it; never guessed
     """
 
     name: str
@@ -38,11 +42,11 @@ class StateSpec:
 
 @dataclass(frozen=True)
 class BundleInfo:
-    """Which weights answered.
+    """The weights that answer.
 
     name      file name, without folders
     checksum  of the file: "xxh3:" and 16 hexadecimal digits
-    source    the checkpoint that was converted, and after an @ its revision; empty where unknown
+    source    the converted checkpoint, followed by @ and its revision if known; empty where unknown
     """
 
     name: str
@@ -53,22 +57,22 @@ class BundleInfo:
 
 @dataclass(frozen=True)
 class Spec:
-    """What `act` takes and what it returns.
+    """The inputs and outputs of `act`.
 
-    min_views     how many views must be present at least
+    min_views     least number of views that must be present
     action_units  one text per action, empty where the bundle does not say
     horizon       rows of a chunk
     d_action      columns of a chunk
     d_noise       columns of the noise
-    noise_rows    its rows: `horizon`, or more where the robot gets some rows only of what the network computes, or where steps of
-                  the solver draw too: then the start comes first, and behind it as many rows for each of these steps
-    noise         its distribution, e.g. "normal"
-    real_time_chunking  what a Leftover does: "guided", "inpainted", or "" where it is refused
+    noise_rows    rows of the noise: `horizon`, or more if the network computes rows that the robot does not get, or if solver steps draw
+                  noise: first the rows of the start, then as many rows for each such step
+    noise         distribution of the noise, e.g. "normal"
+    real_time_chunking  how the policy uses a Leftover: "guided" or "inpainted"; "": it is refused
     embodiment    tag of the robot, where the bundle is for several; else ""
-    robots        of a policy with several: each one's own Spec by its tag. Views, states, actions, horizon and noise are then theirs
-                  alone, and empty here
-    rate_hz       rows per second that the policy was trained for; 0 where the bundle does not say
-    n_action_steps  rows of a chunk that the checkpoint executes before it looks again; 0 where the bundle does not say
+    robots        the Spec of each robot by its tag, for a policy with several. Views, states, actions, horizon and noise are then only in
+                  those, and empty here
+    rate_hz       rows per second in the training data; 0 where the bundle does not say
+    n_action_steps  rows of a chunk that the checkpoint executes before the next observation; 0 where the bundle does not say
     """
 
     views: Tuple[ViewSpec, ...]
@@ -112,7 +116,7 @@ def _view_text(view: ViewSpec) -> str:
 
 
 def _named(names: Sequence[str], units: Sequence[str]) -> str:
-    """": x [m], y [m]" of what has names; units only where the bundle says them."""
+    """Named columns as ": x [m], y [m]", with the units that the bundle states; empty without names."""
     units = units or [""] * len(names)
     texts = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units) if name]
     return ": " + ", ".join(texts) if texts else ""

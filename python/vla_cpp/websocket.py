@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One WebSocket connection whose calls end in time, whatever the server does. Needs the extra `openpi`.
 
-The package websockets has the protocol; the socket is ours, because each wait of it has to end when the caller's time is over: for a
-server that does not read, that sends a byte now and then, or pings without end.
+The package websockets implements the protocol. This module owns the socket, so that every wait ends when the caller's time is over, also
+for a server that does not read, sends a byte now and then, or pings endlessly.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ try:
 except ImportError as error:
     raise ImportError(f"{error}; {extra_hint('openpi')}") from error
 
-PIECE = 1 << 14  # bytes that are read at once: 8192 empty frames, which the package takes 0.1 s for
+PIECE = 1 << 14  # bytes per read: at most 8192 empty frames, which take the package 0.1 s
 
 
 class WebSocket:
-    """until: when a call must be over, by time.monotonic(). Errors of all calls: TimeoutError, OSError, WebSocketException."""
+    """A connection. `until` of its calls: when the call must end, by time.monotonic(). Errors of all: TimeoutError, OSError,
+    WebSocketException."""
 
     def __init__(self, url: str, headers: Dict[str, str], max_message: int, until: float) -> None:
         uri = parse_uri(url)
@@ -61,9 +62,9 @@ class WebSocket:
         return self._messages.pop(0)
 
     def is_silent(self) -> bool:
-        """Whether the server has said nothing since its last answer but pings, which are answered. Does not wait."""
+        """Whether the connection is alive and no message has arrived since the last answer. Answers pings. Does not wait."""
         try:
-            for _ in range(4):  # a server may ping without end
+            for _ in range(4):  # a server may ping endlessly
                 self._exchange(time.monotonic() + 0.001, wait=False)
         except (BlockingIOError, ssl.SSLWantReadError):
             return not self._messages and not self._part
@@ -72,12 +73,12 @@ class WebSocket:
         return False
 
     def close(self) -> None:
-        """At once, without the closing handshake: a server that computes would let us wait for it."""
+        """Closes immediately, without the closing handshake, for which a computing server would make the caller wait."""
         with contextlib.suppress(OSError):
             self._socket.close()
 
     def _exchange(self, until: float, wait: bool = True) -> None:
-        """Takes what has come, once something has, and answers the server's pings."""
+        """Receives once, with `wait` after waiting for data, and answers the server's pings."""
         self._flush(until)
         self._socket.settimeout(_left(until) if wait else 0.0)
         data = self._socket.recv(PIECE)
@@ -127,7 +128,7 @@ def _left(until: float) -> float:
 
 
 def _connected(host: str, port: int, until: float) -> socket.socket:
-    """To the first address of the host that answers."""
+    """A socket connected to the host's first address that answers."""
     problem: OSError = OSError(f"no address of {host}")
     for family, kind, number, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
         made = socket.socket(family, kind, number)

@@ -28,16 +28,17 @@ constexpr Code code_of(int number) {
 /// The protocol versions that this build speaks.
 constexpr std::uint32_t kMinVersion = 1, kMaxVersion = 1;
 
-/// What the I/O thread needs of a request to queue, answer or refuse it, without reading an image.
+/// The part of a request that the I/O thread needs to queue, answer or refuse it, without reading an image.
 struct Envelope {
   std::uint32_t version = 0;
   std::uint64_t request_id = 0;
   Kind kind = Kind::unknown;
   std::size_t body_at = 0, body_size = 0;  // byte range of the serialized Hello, Describe, Act or Health in the request
-  std::optional<std::uint64_t> deadline_ms;  // of an act
-  std::string policy;                        // of an act
+  std::optional<std::uint64_t> deadline_ms;  // deadline of an act
+  std::string policy;                        // policy that an act names
 
-  /// An offset, not a span: ZeroMQ may store a small message inside its object, which moves.
+  /// `body_at` is an offset, since a span would dangle: ZeroMQ may store a small message inside its object, which
+  /// moves.
   std::span<const std::byte> body(std::span<const std::byte> request) const {
     return request.subspan(body_at, body_size);
   }

@@ -13,7 +13,7 @@
 
 namespace vla::wire {
 
-/// An error for bytes that no client sends which follows the schema.
+/// An error for bytes that no client sends if it follows the schema.
 Error not_a_request(std::string where, std::string expected, std::string found);
 
 /// Iterates over the fields of one serialized message without copying or allocating. A field takes two bytes on the
@@ -31,7 +31,7 @@ class Fields {
   std::uint64_t varint = 0;
   std::span<const std::byte> value;
 
-  /// False at the end of the bytes. Errors: bad_request.
+  /// Reads the next field. Returns false at the end of the bytes. Errors: bad_request.
   Result<bool> next();
   /// The refusal of the last field read.
   Error unknown() const;

@@ -9,7 +9,7 @@ void keep_interface(v1::Description& description) {
   description.clear_bundle();
   description.clear_runtime();
   description.clear_limits();
-  description.clear_n_action_steps();  // how a policy is run, not what it takes and gives
+  description.clear_n_action_steps();  // how to run a policy, not its inputs and outputs
   description.clear_rtc();
   for (v1::ViewSpec& view : *description.mutable_views()) view.clear_camera_width(), view.clear_camera_height();
   description.clear_policy();

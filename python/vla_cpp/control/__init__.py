@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Running action chunks on a robot: when to ask, which row to command, what to do when the answer is late (docs/control.md)."""
+"""Executes action chunks on a robot: when to request a chunk, which row to command, what to do when a chunk is late (docs/control.md)."""
 
 from .blend import Blend, CrossFade, Ensemble
 from .episodes import Episode, EpisodeWriter

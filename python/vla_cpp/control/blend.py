@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""How overlapping chunks share a command.
+"""Blends of overlapping chunks.
 
-A blend gives each source a weight for a step; the weights sum to 1, and the command is the weighted sum of the sources' rows. So the
-change from one command to the next is bounded: if a share r of the weight changes hands between two steps, then
+A blend gives each source a weight for a step; the weights sum to 1, and the command is the weighted sum of the sources' rows. This
+bounds the change from one command to the next: if a share r of the weight moves from some sources to others between two steps, then
 
     |command' - command|  <=  (1 - r) * V + r * D
 
-for each column, with V the largest change within a source from one row to the next, and D the largest difference between a row of
-any source for the one step and a row of any source for the other. (The share 1 - r stays with its sources, which move by V at most;
-the share r goes from some source to another, D apart at most.) What a blend does is to keep r small.
+for each column. V is the largest change within a source from one row to the next. D is the largest difference between a row of any
+source for the first step and a row of any source for the second. (The share 1 - r stays with its sources, whose rows change by at most V;
+the share r moves to sources whose rows differ by at most D.) The purpose of a blend is to keep r small.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from ..errors import UsageError
 class Source:
     """Rows that may be commanded. Row i is meant for step `step + i`.
 
-    step     steps that the robot had consumed when the observation was taken
-    tick     control period of the observation; None where the rows are no chunk but the last command, held
+    step     number of rows commanded before the observation was taken
+    tick     control period of the observation; None if the rows repeat the last command instead of coming from a chunk
     rows     float32 (horizon, d_action)
-    entered  first step that it serves
-    fade     steps during which it shares the command with what was there before
+    entered  first step at which the source is used
+    fade     number of steps over which the source takes over from the older sources
     """
 
     step: int
@@ -58,9 +58,9 @@ class Blend:
 
 @dataclass(frozen=True)
 class CrossFade(Blend):
-    """A new chunk takes over in equal shares of 1 / (steps + 1) for each step; `CrossFade(0)` replaces at once.
+    """The weight of a new chunk grows by 1 / (fade_steps + 1) at each step; `CrossFade(0)` switches immediately.
 
-    r is 1 / (k + 1) per step, where k is `steps`, or what the older chunk has left if that is less.
+    r is 1 / (k + 1) per step, where k is `fade_steps`, or the number of rows that the older chunk has left if that is less.
     """
 
     fade_steps: int
@@ -81,10 +81,10 @@ class CrossFade(Blend):
 
 @dataclass(frozen=True)
 class Ensemble(Blend):
-    """Temporal ensembling of ACT (Zhao et al. 2023, algorithm 2; imitate_episodes.py): all chunks that have a row for the step
-    count, with weight exp(-decay * i), i = 0 for the oldest. 0.01 is what ACT published; there chunks come at every step.
+    """Temporal ensembling of ACT (Zhao et al. 2023, algorithm 2; imitate_episodes.py): every chunk with a row for the step has a weight
+    proportional to exp(-decay * i), i = 0 for the oldest. ACT published 0.01, with a new chunk at every step.
 
-    r is the share of the chunk that enters, or of one that has run out.
+    r is the weight of the chunk that enters, or of the one that ends.
     """
 
     decay: float
@@ -94,6 +94,6 @@ class Ensemble(Blend):
             raise UsageError("decay", "a finite number, 0 or more", str(self.decay))
 
     def weights(self, sources: Sequence[Source], step: int) -> np.ndarray:
-        # math.exp and a sum in order give the bits of the loop in C++; numpy's exp and sum differ in the last one.
+        # math.exp and a sequential sum give the same bits as the loop in C++; numpy's exp and sum differ in the last bit.
         weights = np.array([math.exp(-self.decay * i) for i in range(len(sources))])
         return weights / np.cumsum(weights)[-1]

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a robot saw and did, tick by tick, with what a person corrected. `vla-export --lerobot` makes a LeRobot data set of it.
+"""Records observations and actions of a robot per control period, with a person's corrections. `vla-export --lerobot` makes a LeRobot
+data set of them.
 
     with EpisodeWriter("episodes", policy.spec, rate_hz=20) as episodes:
         episodes.begin("open the drawer")
@@ -10,8 +11,8 @@
             episodes.add(seen, action)
         episodes.end(success=True)
 
-An episode is a folder: `episode.json` says what a frame holds, `frames.bin` has one frame after the other, all of one size. A frame that
-was written is whole whatever happens then; an episode without an `end` has no success.
+An episode is a folder: `episode.json` describes the frames, and `frames.bin` holds them one after the other, all of the same size. A
+written frame stays readable if the program dies; an episode without an `end` has no success.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ MAX_FRAME = 1 << 30  # bytes
 
 @dataclass(frozen=True)
 class Header:
-    """What an episode says of itself. images: (height, width) by view; states: names of the numbers by feature."""
+    """The contents of episode.json. images: (height, width) by view; states: names of the numbers by feature."""
 
     text: str
     rate_hz: float
@@ -58,7 +59,7 @@ class Header:
     success: Optional[bool] = None
 
     def frame_type(self) -> np.dtype:
-        """The bytes of a frame. `action` and `policy` are NaN where there was none. Errors: ValueError beyond MAX_FRAME."""
+        """The layout of a frame. `action` and `policy` are NaN where there was none. Errors: ValueError beyond MAX_FRAME."""
         if sum(3 * height * width for height, width in self.images.values()) > MAX_FRAME:
             raise ValueError(f"images of more than {MAX_FRAME} bytes")
         fields: List[Any] = [("tick", "<i8"), ("human", "?"), ("held", "?")]
@@ -70,7 +71,7 @@ class Header:
 
 
 class Episode:
-    """An episode that was written. Errors: IoError (no episode), BadRequest (damaged, with the place)."""
+    """Reads an episode. Errors: IoError (no episode), BadRequest (damaged, with the place)."""
 
     def __init__(self, folder: Union[str, Path]) -> None:
         self.folder = Path(folder)
@@ -81,7 +82,7 @@ class Episode:
         except OSError as problem:
             raise IoError(str(self.folder / FRAMES), "frames of an episode", str(problem)) from None
         self.n_frame, rest = divmod(size, self._type.itemsize)
-        self.is_cut = rest > 0  # the writer was killed within a frame, which is left out
+        self.is_cut = rest > 0  # the writer was killed while it wrote a frame; that frame is left out
 
     def __iter__(self) -> Iterator[np.void]:
         with open(self.folder / FRAMES, "rb") as file:
@@ -93,7 +94,7 @@ class Episode:
 
 
 def episodes_of(folder: Union[str, Path]) -> List[Episode]:
-    """All episodes of a folder, in order. Errors: as Episode; UsageError where there is none."""
+    """All episodes of a folder, in order. Errors: those of Episode; UsageError if there is none."""
     found = sorted(path for path in Path(folder).glob("episode_*") if (path / HEADER).is_file())
     if not found:
         raise UsageError(str(folder), "episodes that EpisodeWriter wrote", "none")
@@ -101,10 +102,10 @@ def episodes_of(folder: Union[str, Path]) -> List[Episode]:
 
 
 class EpisodeWriter:
-    """Writes episodes into a folder. `add` copies what it is given and never waits for the disk; where the disk does not keep up, `add`
-    raises IoError, since frames that are left out silently would teach a wrong speed.
+    """Writes episodes into a folder. `add` copies its arguments and never waits for the disk. If the disk is too slow, `add` raises
+    IoError, since silently dropped frames would teach a wrong speed.
 
-    folder   new episodes are numbered after those that are there
+    folder   new episodes are numbered after the existing ones
     rate_hz  control periods per second
     """
 
@@ -120,7 +121,7 @@ class EpisodeWriter:
         self._thread: Optional[threading.Thread] = None
 
     def begin(self, text: str) -> None:
-        """An episode begins. Errors: UsageError where the last one has not ended; IoError."""
+        """Begins an episode. Errors: UsageError if the last one has not ended; IoError."""
         if self._text is not None:
             raise UsageError("begin", "the end of the episode before", "one that goes on")
         try:
@@ -133,9 +134,9 @@ class EpisodeWriter:
         self._text, self._header, self._problem = text, None, None
 
     def add(self, observation: Mapping[str, Any], action: Action) -> None:
-        """One control period: what `policy.act` would be given, and what `loop.step` returned.
+        """Adds a control period: the arguments of `policy.act`, and the result of `loop.step`.
 
-        Errors: UsageError before `begin`; BadObservation for other views, sizes or states than in the episode's first frame; IoError.
+        Errors: UsageError before `begin`; BadObservation for views, sizes or states that differ from the episode's first frame; IoError.
         """
         if self._text is None or self._at is None:
             raise UsageError("add", "begin first", "no episode")
@@ -166,7 +167,7 @@ class EpisodeWriter:
             raise IoError(str(self._at), f"a disk that takes {frame.nbytes} bytes {self._rate_hz:g} times a second", "a slower one") from None
 
     def end(self, success: Optional[bool]) -> None:
-        """The episode is over; whether it was a success, where somebody says. An episode without frames is removed. Errors: IoError."""
+        """Ends the episode. `success`: whether it succeeded, None if unknown. An episode without frames is removed. Errors: IoError."""
         if self._text is None or self._at is None:
             raise UsageError("end", "an episode", "none")
         self._stop()
@@ -178,7 +179,7 @@ class EpisodeWriter:
         write_header(self._at, Header(**{**vars(self._header), "success": success}))
 
     def close(self) -> None:
-        """Ends what goes on, without a success."""
+        """Ends the current episode, if any, with an unknown success."""
         if self._text is not None:
             self.end(None)
 
@@ -207,7 +208,7 @@ class EpisodeWriter:
         self._thread.start()
 
     def _write(self, file: FileIO) -> None:
-        """Appends frames until `_stop`. After a problem it only takes them, and what was written of the last one is cut off."""
+        """Appends queued frames until `_stop`. After an error it truncates the partly written frame and discards further frames."""
         with file:
             while (data := self._queue.get()) is not None:
                 try:

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""From the commands of a policy's rate to those of a faster controller.
+"""Interpolates commands from a policy's rate to the rate of a faster controller.
 
-A command of a control period is reached at the end of that period, so what is interpolated comes one period later than what is not
-(`delay_s`). Within the period a position follows a polynomial from where it is to the command:
+A command is reached at the end of its control period, so interpolated commands come one period later than the original ones (`delay_s`).
+Within the period a position follows a polynomial from its current value to the command:
 
-    linear        of degree 1: continuous
-    cubic         of degree 3, from the velocity that it has to the mean velocity between the last two commands: continuous velocity
-    minimum_jerk  of degree 5, also from the acceleration that it has to none: continuous acceleration. Among all motions with these
-                  ends it has the least squared jerk (Flash and Hogan 1985)
+    linear        degree 1: continuous position
+    cubic         degree 3, from the current velocity to the mean velocity between the last two commands: continuous velocity
+    minimum_jerk  degree 5, as cubic, and from the current acceleration to zero: continuous acceleration. Among all motions with these end
+                  conditions it has the least squared jerk (Flash and Hogan 1985)
 
-so a new chunk, or a late one, makes no jump either. A polynomial may pass its ends by a little where a motion turns; a Limiter at the
-controller's rate keeps that within limits. A velocity and a gripper are held for their period. A difference is spread over it: its parts sum to it.
+So a new or late chunk causes no jump. A polynomial may slightly overshoot where a motion reverses; a Limiter at the controller's rate keeps
+it within limits. A velocity or gripper command is held for the period. A difference is spread over the period: its parts sum to it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ import numpy as np
 from ..errors import UsageError
 from .limits import KINDS, finite_row
 
-# Coefficients of s^0 ... s^5, s from 0 to 1 over a period, from: place, velocity and acceleration at 0; the same at 1.
+# Matrices from the end conditions (position, velocity and acceleration at s = 0, then at s = 1) to the coefficients of s^0 ... s^5; s goes
+# from 0 to 1 over a period.
 METHODS: Dict[str, np.ndarray] = {
     "linear": np.array([[1, -1], [0, 0], [0, 0], [0, 1], [0, 0], [0, 0]], float).T,
     "cubic": np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, 0, 0], [0, 0, 3, -2], [0, 0, -1, 1], [0, 0, 0, 0]], float).T,
@@ -41,7 +42,7 @@ METHODS: Dict[str, np.ndarray] = {
 
 
 class Interpolator:
-    """Commands within control periods.
+    """Interpolates commands within control periods.
 
         between = Interpolator(["position"] * 6 + ["velocity"], method="minimum_jerk", rate_hz=20)
         between.start_at(joints())
@@ -53,7 +54,7 @@ class Interpolator:
 
     kinds    "position", "velocity", "difference" or "gripper" of each column
     method   how positions are interpolated: "linear", "cubic" or "minimum_jerk"
-    rate_hz  control periods a second
+    rate_hz  control periods per second
     """
 
     def __init__(self, kinds: Sequence[str], *, method: str, rate_hz: float) -> None:
@@ -72,14 +73,14 @@ class Interpolator:
         self._s = 1.0
 
     def start_at(self, values: Any) -> None:
-        """The robot rests at these values; of velocities and differences zero is meant."""
+        """The robot rests at these values; values of velocities and differences are ignored and taken as zero."""
         self._command = np.where(self._is_place, finite_row("start_at", values, len(self._is_place)), 0.0)
         self._coefficients[:] = 0
         self._coefficients[0] = self._command
         self._s = 1.0
 
     def to(self, values: Any) -> None:
-        """A control period begins, in which this command is to be reached; the one before ends where it was asked for last.
+        """Begins a control period, at whose end this command is reached. The motion continues from the last call of `at`.
 
         Errors: UsageError before `start_at`; BadAction for a value that is not finite.
         """
@@ -92,9 +93,9 @@ class Interpolator:
         self._command, self._s = wanted, 0.0
 
     def at(self, s: float) -> np.ndarray:
-        """The command, float32, when this share of the period is over: later than the one before, 1 at most.
+        """The command, float32, at this share of the period: above the share of the last call, at most 1.
 
-        Of a difference it is the part since the one before.
+        For a difference it is the part since the last call.
         """
         if not self._s < s <= 1:
             raise UsageError("s", f"a share of the period above {self._s:g}, 1 at most", str(s))
@@ -104,7 +105,7 @@ class Interpolator:
         return np.where(self._is_place, place, rest).astype(np.float32)
 
     def _motion(self, s: float) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Place, velocity and acceleration of the polynomials, in periods."""
+        """Position, velocity and acceleration of the polynomials, with the period as unit of time."""
         n = len(self._coefficients)
         k = np.arange(n)
         power = [s**k, k * s ** np.maximum(k - 1, 0), k * (k - 1) * s ** np.maximum(k - 2, 0)]

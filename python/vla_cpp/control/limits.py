@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a command may be: ranges, velocities, accelerations and jerks of each action column, as data.
+"""Limits of commands: range, velocity, acceleration and jerk of each action column.
 
-A `Limiter` changes as little as it can of a command that breaks a limit, and nothing of one that keeps all of them. It keeps this
-invariant: **from the last command there is a stop within all limits**, a list of accelerations after which the column rests.
+A `Limiter` leaves a command within all limits unchanged and changes any other as little as possible. It keeps this invariant: **from the
+last command there is a stop within all limits**, that is, a list of accelerations after which the column rests.
 
 * Before the first command the column rests, and the stop is empty.
-* A command is taken as it is if it keeps the limits and a stop from it is found (`_stops`).
-* Else one between it and the next command of the kept stop is taken, as near to the wanted one as a search by halves finds with a
-  stop of its own; in the worst case the next command of the kept stop itself, whose rest is the stop from there.
+* A command is used unchanged if it is within the limits and a stop from it is found (`_stops`).
+* Otherwise the limiter uses a command between the wanted one and the next command of the stored stop: by bisection the nearest to the
+  wanted one from which a stop is found. In the worst case it is the next command of the stored stop, whose remainder is the new stop.
 
-So every command keeps every limit, by induction; and since a later command starts from a state with a stop, cutting one never leaves
-the next ones without a permitted value. Commands stay in their order: each is made from its own row and from the ones before alone.
-Numbers are double; a command is rounded to float32 once, so that a difference of two may be off by that rounding.
+So, by induction, every command is within every limit, and after a changed command there is always a permitted next one. A command depends
+only on its own row and on earlier commands. Numbers are double; each command is rounded to float32 once, so a difference of two commands
+may be off by that rounding.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from ..strict_json import no_constant, unique_names
 
 FORMAT = "vla-limits 1"
 KINDS = ("position", "velocity", "difference", "gripper")
-N_HALF = 16  # halvings, at most, of the search for a permitted command
-MAX_STOP = 4096  # steps of the longest stop that is looked for
+N_HALF = 16  # most bisection steps of the search for a permitted command
+MAX_STOP = 4096  # most steps of a stop
 MAX_FILE = 1 << 20  # bytes
-FAR = 1e9  # in place of a limit that is not given
-SLACK = 1e-9  # of rounding in double, relative to the limit
-ROUNDING = 1e-12  # of a product in double, and far below the slack
+FAR = 1e9  # stands for a limit that is not given
+SLACK = 1e-9  # tolerance for rounding in double, relative to the limit
+ROUNDING = 1e-12  # relative rounding error of a product in double; far below SLACK
 
 
 @dataclass(frozen=True)
 class Column:
-    """The limits of an action column, in its unit and seconds. None: not limited.
+    """The limits of an action column, in the column's unit and seconds. None: not limited.
 
-    kind          "position": the value is a place. "velocity": units per second. "difference": units per control period.
-                  "gripper": an opening or a decision, which may jump and is never mixed with another: it has a range alone
-    unit          as the bundle says it; empty where it does not
-    low, high     of the value itself
-    velocity      largest change of place a second: of a position between commands, of the others the value itself
-    acceleration  largest change of the velocity a second
-    jerk          largest change of the acceleration a second
+    kind          "position": the value is a position. "velocity": units per second. "difference": units per control period.
+                  "gripper": an opening or an open/close decision, which may jump and is never blended: it has only a range
+    unit          as the bundle states it; else empty
+    low, high     range of the value itself
+    velocity      largest speed, in units per second: for a position the change between commands, for other kinds the value itself
+    acceleration  largest change of the velocity per second
+    jerk          largest change of the acceleration per second
     """
 
     name: str
@@ -84,7 +84,7 @@ class Limits:
 
     @staticmethod
     def read(path: Union[str, Path]) -> Limits:
-        """A file that `write` wrote or a person: docs/control.md."""
+        """Reads a file of limits, made by `write` or by hand (docs/control.md). Errors: UsageError."""
         try:
             if not os.path.isfile(path) or os.path.getsize(path) > MAX_FILE:
                 raise ValueError(f"no regular file of at most {MAX_FILE} bytes")
@@ -112,11 +112,12 @@ class Limits:
     def suggest(
         spec: Spec, kinds: Mapping[str, str], commands: np.ndarray, rate_hz: float, *, margin: float, refuse_above: float
     ) -> Limits:
-        """First limits from what a robot really was commanded: the largest of each, times `margin`.
+        """Initial limits from recorded commands of a robot: the largest of each quantity, times `margin`.
 
         kinds     "position", "velocity", "difference" or "gripper" of each action
-        commands  (n, d_action), n of at least four, one after the other at `rate_hz`
-        margin    1 or more; a range grows by its share of the range. That of a gripper stays: it is open or closed at its ends
+        commands  (n, d_action), at least four consecutive commands at `rate_hz`
+        margin    1 or more; a range is widened around its middle to `margin` times its width. The range of a gripper keeps its width: its
+                  ends mean open and closed
         """
         rows = np.asarray(commands, np.float64)
         if rows.ndim != 2 or rows.shape[1] != spec.d_action or len(rows) < 4 or not np.isfinite(rows).all():
@@ -139,7 +140,7 @@ class Limits:
         return Limits(tuple(columns), refuse_above)
 
     def of(self, spec: Spec) -> Limits:
-        """The same in the order of the policy's columns. Errors: UsageError where names or units differ from the bundle's."""
+        """These limits in the order of the policy's columns. Errors: UsageError if names or units differ from the bundle's."""
         given = {c.name: c for c in self.columns}
         _check_names(given, spec)
         for name, unit in zip(spec.action_names, spec.action_units or [""] * spec.d_action):
@@ -149,14 +150,14 @@ class Limits:
 
 
 class Stops(NamedTuple):
-    """A way to rest for each column: accelerations [steps, columns], zeros after a column's own; `found`: where there is one."""
+    """A stop of each column. steps: accelerations [steps, columns], zeros after the column's last step; found: whether a stop exists."""
 
     found: np.ndarray
     steps: np.ndarray
 
 
 class Limiter:
-    """Keeps the commands of one robot within limits. One `step` for each control period, in order.
+    """Keeps the commands of one robot within limits. Call `step` once for each control period, in order.
 
     limits   in the order of the columns (`Limits.of`)
     rate_hz  commands per second
@@ -172,7 +173,7 @@ class Limiter:
         low, high = np.where(self.is_gripper, -FAR, low), np.where(self.is_gripper, FAR, high)
         scale = np.array([_scale(c.kind, rate_hz) for c in columns]).T
         most = [np.array([_or(getattr(c, f), math.inf) for c in columns]) * s for f, s in zip(("velocity", "acceleration", "jerk"), scale)]
-        # Where a limit is missing, one that the others imply: none of these is ever reached.
+        # A missing limit is replaced by a value that the other limits imply, so that no command reaches it.
         self._low, self._high = np.where(self._is_place, low, -np.inf), np.where(self._is_place, high, np.inf)
         step = np.minimum(most[0], np.where(self._is_place, np.maximum(high - low, 0), FAR))
         self._slowest = np.where(self._is_place, -step, np.maximum(low, -step))
@@ -182,16 +183,16 @@ class Limiter:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the commands: where a position is has to be said again by `rest_at`."""
+        """Forgets the commands; columns of positions then need `rest_at` again."""
         n = len(self._is_place)
         self._place = np.where(self._is_place | self.is_gripper, np.nan, 0.0)
         self._velocity, self._change = np.zeros(n), np.zeros(n)
         self._stop = np.zeros((0, n))
 
     def rest_at(self, values: Any) -> None:
-        """The robot rests at these values; of velocities and differences zero is meant, whatever is given.
+        """The robot rests at these values; values of velocities and differences are ignored and taken as zero.
 
-        Errors: UsageError for a position outside of its limits, from which no command would be permitted.
+        Errors: UsageError for a position outside its limits, from which no command would be permitted.
         """
         values = finite_row("rest_at", values, len(self._is_place))
         outside = self._is_place & ((values < self._low) | (values > self._high))
@@ -203,11 +204,11 @@ class Limiter:
         self._place = np.where(self._is_place | self.is_gripper, values, 0.0)
 
     def still(self) -> np.ndarray:
-        """What stands still where no column is a position: zeros, and of a gripper its last command. float32."""
+        """The command that stops a robot without position columns: zeros, and for a gripper its last command. float32."""
         return np.where(self.is_gripper, self._place, 0.0).astype(np.float32)
 
     def step(self, values: Any) -> Tuple[np.ndarray, np.ndarray]:
-        """The command for wanted values, float32, and which of its columns differ from them.
+        """The permitted command nearest to the wanted values, float32, and which columns differ from them.
 
         Errors: UsageError before `rest_at` where there is a position; BadAction for a value that is not finite.
         """
@@ -230,15 +231,15 @@ class Limiter:
         return out.astype(np.float32), is_cut
 
     def breaks(self, rows: np.ndarray) -> np.ndarray:
-        """Which rows of a chunk break a limit by themselves or together with the rows before them: bool, one a row."""
+        """Whether each row of a chunk breaks a limit, alone or together with the rows before it: one bool per row."""
         rows = np.asarray(rows, np.float64)
-        slack = 8 * np.finfo(np.float32).eps * np.abs(rows).max(0, initial=0)  # rows are float32, and differences of them
+        slack = 8 * np.finfo(np.float32).eps * np.abs(rows).max(0, initial=0)  # rounding of float32 rows and their differences
         velocity = np.where(self._is_place, np.diff(rows, axis=0, prepend=rows[:1]), np.where(self.is_gripper, 0.0, rows))
         broken = self._is_place & ((rows < self._low - slack) | (rows > self._high + slack))
         broken |= self.is_gripper & ((rows < self._closed - slack) | (rows > self._open + slack))
         broken |= (velocity < self._slowest - slack) | (velocity > self._fastest + slack)
         index = np.arange(len(rows))[:, None]
-        first = np.where(self._is_place, 2, 1)  # row that has an acceleration: two velocities before it are known
+        first = np.where(self._is_place, 2, 1)  # first row with a known acceleration, which needs two velocities
         for n, most in enumerate((self._acceleration, self._jerk)):
             change = np.diff(velocity, n + 1, axis=0, prepend=np.zeros((n + 1, rows.shape[1])))
             broken |= (index >= first + n) & (np.abs(change) > most + 2 ** (n + 1) * slack)
@@ -247,16 +248,16 @@ class Limiter:
     # --- inside ----------------------------------------------------------------------------------------------------------------
 
     def _span(self) -> Tuple[np.ndarray, np.ndarray]:
-        """The least and the largest acceleration that keep every limit in this step."""
+        """The smallest and the largest acceleration of this step within every limit."""
         ahead = self._place + self._velocity
         low = np.maximum.reduce([-self._acceleration, self._change - self._jerk, self._slowest - self._velocity, self._low - ahead])
         high = np.minimum.reduce([self._acceleration, self._change + self._jerk, self._fastest - self._velocity, self._high - ahead])
         return low, high
 
     def _nearest(self, kept: np.ndarray, wanted: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
-        """The acceleration of each column that is nearest to the wanted one and has a stop, and these stops.
+        """For each column the acceleration nearest to the wanted one after which a stop exists, and that stop.
 
-        The search ends where the nearest that has one and the nearest that has none are the same command.
+        The bisection ends when its two ends, one with a stop and one without, round to the same float32 command.
         """
         stops = self._stops(wanted)
         if stops.found.all():
@@ -264,9 +265,9 @@ class Limiter:
         n = max(len(stops.steps), len(self._stop))
         best = np.where(stops.found, wanted, kept)
         plan = np.where(stops.found, _padded(stops.steps, n), _padded(self._stop[1:], n))
-        near, far = np.where(stops.found, 1.0, 0.0), np.ones(len(wanted))  # shares of the way from kept to wanted
+        near, far = np.where(stops.found, 1.0, 0.0), np.ones(len(wanted))  # positions between kept (0) and wanted (1)
         ahead = np.where(self._is_place, self._place + self._velocity, self._velocity)
-        beyond = wanted  # the nearest one that has none
+        beyond = wanted  # the nearest acceleration without a stop so far
         for _ in range(N_HALF):
             is_open = (near < far) & ((ahead + best).astype(np.float32) != (ahead + beyond).astype(np.float32))
             if not is_open.any():
@@ -284,9 +285,10 @@ class Limiter:
     def _stops(self, change: np.ndarray) -> Stops:
         """The shortest stop of each column after a step with this acceleration.
 
-        A stop of n steps has accelerations between the bounds that the limits give them, forwards from this one and backwards from
-        rest, and a sum that takes the velocity away. Its bounds are convex, so a share between all lower and all upper ones keeps
-        them, and their sums say which; a stop of n steps is one of n + 1 too, so the least n is found by halves.
+        A stop of n steps is a sequence of accelerations whose sum cancels the velocity. The limits bound each acceleration, forwards from
+        the current one and backwards from rest (`_bounds`). The bounds are convex, so every interpolation between all lower and all upper
+        bounds keeps them, and the sums of the bounds give the share that cancels the velocity. A stop of n steps is also one of n + 1
+        steps, so bisection finds the least n.
         """
         velocity = self._velocity + change
         place = np.where(self._is_place, self._place + velocity, 0.0)
@@ -308,11 +310,11 @@ class Limiter:
         return Stops(found, steps)
 
     def _least_steps(self, velocity: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """The least number of steps in which each column can rest; -1 where it is beyond MAX_STOP."""
+        """The least number of steps after which each column can rest; -1 if that is above MAX_STOP."""
 
         def enough(n: np.ndarray) -> np.ndarray:
             slack = SLACK * (1 + np.abs(velocity))
-            rests = np.abs(change) <= (n + 1) * self._jerk * (1 + ROUNDING)  # more would make n + 1 steps too few where n are enough
+            rests = np.abs(change) <= (n + 1) * self._jerk * (1 + ROUNDING)  # with more tolerance, n + 1 steps could fail where n suffice
             return rests & (self._least_sum(change, n) <= -velocity + slack) & (-self._least_sum(-change, n) >= -velocity - slack)
 
         few, many = np.full(len(change), -1), np.zeros(len(change), int)
@@ -328,17 +330,17 @@ class Limiter:
         return np.where(reachable, many, -1)
 
     def _least_sum(self, change: np.ndarray, n: np.ndarray) -> np.ndarray:
-        """The sum of the least accelerations of `_bounds` over n steps: they fall by the jerk from this one, stay at their least, and
-        rise by the jerk to rest."""
+        """The sum of the lower bounds of `_bounds` over n steps: they fall by the jerk per step from the current acceleration, stay at the
+        minimum, and rise by the jerk per step to rest."""
         most, jerk = self._acceleration, self._jerk
         fall = np.clip(np.floor(np.minimum((change + most) / jerk, ((n + 1) * jerk + change) / (2 * jerk))), 0, n)
         rise = np.minimum(n - fall, np.floor(most / jerk))
         return fall * change - jerk * (fall * (fall + 1) / 2 + rise * (rise + 1) / 2) - (n - fall - rise) * most
 
     def _bounds(self, change: np.ndarray, n: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
-        """The least and largest accelerations of steps 1 to n from this one to rest: [steps, columns], zeros after n.
+        """Bounds of the accelerations in steps 1 to n, from the current acceleration to rest: [steps, columns], zeros after the end.
 
-        Without steps the column must rest already, within the jerk: a row that cannot be says so by crossed bounds.
+        A column with n = 0 must be able to rest within the jerk limit; if it cannot, its lower bound is above its upper bound.
         """
         i = np.arange(1, max(int(n.max()), 0) + 2)[:, None]
         forth, back = i * self._jerk, np.maximum(n + 1 - i, 0) * self._jerk
@@ -349,12 +351,12 @@ class Limiter:
 
 
 def gripper(name: str, unit: str, low: float, high: float) -> Column:
-    """The limits of a gripper that was commanded between these values; none where they are one."""
+    """The limits of a gripper that was commanded between these values; no limits if the values are equal."""
     return Column(name, "gripper", unit, low, high) if low < high else Column(name, "gripper", unit)
 
 
 def finite_row(where: str, values: Any, n: int) -> np.ndarray:
-    """One number for each of n columns, in double. Errors: BadAction."""
+    """The values as n finite doubles. Errors: BadAction."""
     row = np.array(values, np.float64)
     if row.shape != (n,) or not np.isfinite(row).all():
         raise BadAction(where, f"{n} finite numbers", str(values))
@@ -366,7 +368,7 @@ def _padded(steps: np.ndarray, n: int) -> np.ndarray:
 
 
 def _scale(kind: str, rate_hz: float) -> Tuple[float, float, float]:
-    """Factors from units and seconds to changes a step: of velocity, acceleration and jerk."""
+    """Factors from units and seconds to changes per step, for velocity, acceleration and jerk."""
     first = 1.0 if kind == "velocity" else 1 / rate_hz
     return first, first / rate_hz, first / (rate_hz * rate_hz)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The driver of a ChunkSchedule: asks a policy, keeps the time."""
+"""Runs a ChunkSchedule: requests chunks from a policy and keeps the control rate."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .schedule import Action, ChunkSchedule, OnLate, late_rule
 
 Observation = Union[Mapping[str, Any], Callable[[], Mapping[str, Any]]]
 
-# What another observation may well survive. Everything else would come again, and is raised.
+# Errors after which another observation may succeed. All other errors would recur, and are raised.
 PASSING = (Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout)
 ACT_DECAY = 0.01
 LOG = logging.getLogger("vla_cpp.control")
@@ -33,9 +33,9 @@ LOG = logging.getLogger("vla_cpp.control")
 class RealTimeChunking:
     """How a chunk continues the previous one, in the mode "rtc".
 
-    overlap       rows of the newest chunk, of those that are not commanded yet, which an observation brings along at most
-    schedule      of a guided policy, as `vla_cpp.Leftover` has it
-    max_guidance  the same
+    overlap       most rows of the newest chunk that are sent with an observation; only rows that are not commanded yet are sent
+    schedule      only for a guided policy: `schedule` of `vla_cpp.Leftover`
+    max_guidance  only for a guided policy: `max_guidance` of `vla_cpp.Leftover`
     """
 
     overlap: int
@@ -55,30 +55,30 @@ class ChunkLoop:
             loop.pace()
 
     policy        vla_cpp.Client, vla_cpp.Policy, or anything with their `spec` and `act`
-    rate_hz       control periods per second; must be what the policy was trained for, where its bundle says, unless
-                  allow_other_rate is set. None: what the bundle says
-    replan_every  rows of a chunk that are commanded before the next observation is taken. None: the checkpoint's n_action_steps, where
-                  its bundle says. What is taken from the bundle is told in the log "vla_cpp.control", and so is another number
-    mode          "sync": `step` waits for the chunk; the robot stands meanwhile. "async": the chunk is computed while rows of the
-                  one before are commanded, and those rows of it that are past when it comes are skipped. "rtc": as "async", and the
-                  policy goes on from the rows of the one before that are not commanded yet
+    rate_hz       control periods per second; must equal the training rate if the bundle states it, unless allow_other_rate is set.
+                  None: the rate in the bundle
+    replan_every  rows of a chunk that are commanded before the next observation is taken. None: the checkpoint's n_action_steps, if the
+                  bundle states it. A value taken from the bundle, or differing from it, is logged in "vla_cpp.control"
+    mode          "sync": `step` waits for the chunk; the robot stands still meanwhile. "async": the chunk is computed while rows of the
+                  previous chunk are commanded; its rows whose steps have passed on arrival are skipped. "rtc": as "async", and the policy
+                  continues the rows of the previous chunk that are not commanded yet
     blend         "replace"; "linear", over `fade_steps` steps; "ensemble", with `decay`; or a Blend
     rtc           RealTimeChunking, for the mode "rtc"
     on_late       what to command when no chunk has a row: "hold" repeats the last command, which is right for positions and WRONG
                   for velocities and differences; "zero" commands zeros; "stop" raises Late; a function (last command or None, tick)
-                  returns the values, or None to command nothing. When a chunk comes, commands go on with its row for this step
-    on_note       what to do with a chunk that comes with notes, such as a state far from what the policy was trained with: "ignore"
-                  them, "warn" of each (Python's warnings), or "raise" Noted instead of commanding the chunk. `stats` counts them
-    max_age       seconds between an observation and the last command that may come of it. By default the time that the rows of a
-                  chunk take in "async" mode; in "sync" mode, where the robot stands still meanwhile, any
-    limits        Limits, or the file of some (docs/control.md): no command breaks them, and `start_at` says first where the robot is.
-                  A chunk that breaks them in too many rows is BadAction. None: the robot's own controller has to refuse
-    max_jump      largest change of each value from one command to the next, beyond which it is cut: a number, or one per value
-    clock, sleep  seconds, and waiting for so many: time.monotonic and time.sleep
+                  returns the values, or None to command nothing. When a chunk arrives, commands continue with its row for that step
+    on_note       what to do with a chunk that has notes, e.g. of a state far from the training data: "ignore" the notes, "warn" of each
+                  (Python's warnings), or "raise" Noted instead of commanding the chunk. `stats` counts the notes
+    max_age       most seconds from an observation to a command based on it. Default: in "async" mode the duration of a chunk's rows; in
+                  "sync" mode, where the robot stands still during inference, no limit
+    limits        Limits, or the path of a limits file (docs/control.md): every command is kept within them. Call `start_at` first. A chunk
+                  that breaks them in too many rows raises BadAction. None: only the robot's own controller can refuse commands
+    max_jump      largest change of each value from one command to the next; a larger change is cut. A number, or one per value
+    clock, sleep  functions that return the time in seconds and that wait for seconds; default time.monotonic and time.sleep
 
-    One thread may use a loop. `step` is to be called once in each control period. Errors of the policy that another try may
-    survive (Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout) are counted in `stats`; the next period tries again, and
-    `on_late` decides what happens meanwhile. `last_error` is that of the newest inference, or None. All others are raised by `step`.
+    Only one thread may use a loop. Call `step` once in each control period. Transient errors of the policy (Busy, Disconnected, Late,
+    ShuttingDown, Superseded, Timeout) are counted in `stats`; the next period retries, and `on_late` supplies commands meanwhile.
+    `last_error` is the error of the newest inference, or None. `step` raises all other errors.
     """
 
     def __init__(
@@ -134,13 +134,13 @@ class ChunkLoop:
         )
         self.rate_hz, self.mode, self.rtc, self.on_note = rate_hz, mode, rtc, on_note
         self._policy, self._clock, self._sleep = policy, clock, sleep
-        # A client answers without waiting by itself; any other policy computes in a thread of its own.
+        # A client has `submit`, which does not wait; any other policy runs in a worker thread.
         self._worker = None if hasattr(policy, "submit") else ThreadPoolExecutor(1, "vla-act")
         self._handle: Any = None
         self._forget()
 
     def _forget(self) -> None:
-        self.driver: Optional[str] = None  # the person who took over
+        self.driver: Optional[str] = None  # name of the person who drives
         self._start: Optional[float] = None
         self._tick = -1
         self._missed = self._notes = 0
@@ -148,24 +148,24 @@ class ChunkLoop:
         self.last_error: Optional[VlaError] = None
 
     def start_at(self, values: Any) -> None:
-        """Where the robot rests now, one number for each action: `limits` are kept from there. Again after `reset`.
+        """States the values at which the robot rests now, one number for each action: `limits` apply from there. Repeat after `reset`.
 
-        Errors: UsageError without limits, or for a position outside of them.
+        Errors: UsageError without limits, or for a position outside its limits.
         """
         if not self._limiter:
             raise UsageError("start_at", "a loop with limits", "none")
         self._limiter.rest_at(values)
 
     def take_over(self, who: str) -> None:
-        """A person drives from now on: `step` takes their commands, in `human`. The policy is still asked, and `Action.policy` is what it
-        wanted. Errors: UsageError where another person drives."""
+        """Lets a person drive: `step` then commands its argument `human`. The policy keeps computing, and `Action.policy` is its command.
+        Errors: UsageError if another person drives."""
         if self.driver is not None:
             raise UsageError("take_over", "nobody who drives", self.driver)
         self.driver = who
 
     def give_back(self, who: str) -> None:
-        """The policy drives again, from what it sees then: chunks of the time before are not used, and commands go on from the person's
-        last one, as `on_late` and `blend` say. Errors: UsageError for somebody who does not drive."""
+        """Lets the policy drive again, with chunks from new observations: earlier chunks are dropped. Commands continue from the person's
+        last one by the rules of `on_late` and `blend`. Errors: UsageError if `who` does not drive."""
         if self.driver != who:
             raise UsageError("give_back", f"{who}, who drives", str(self.driver or "nobody"))
         self.driver = None
@@ -175,10 +175,10 @@ class ChunkLoop:
     def step(self, observation: Observation, human: Any = None) -> Action:
         """One control period.
 
-        observation  the arguments of `policy.act`, or a function that returns them, called only when an observation is wanted:
-                     cameras need not be read for a period that does not look at them
-        human        of the person who drives: one number for each action, within the limits. Without it, while a person drives, the command
-                     is what `on_late` says
+        observation  the arguments of `policy.act`, or a function that returns them. The function is called only when an observation is
+                     needed, so that cameras are not read in other periods
+        human        the driving person's command, one number for each action; it is kept within the limits. If None while a person drives,
+                     `on_late` supplies the command
         """
         if human is not None and self.driver is None:
             raise UsageError("human", "a person who drives: take_over", "nobody")
@@ -197,7 +197,7 @@ class ChunkLoop:
         return self.schedule.next(tick, human)
 
     def begin(self, observation: Observation) -> None:
-        """Waits for a first chunk, so that the first `step` has an action. Errors: all that `policy.act` raises."""
+        """Waits for a first chunk, so that the first `step` has an action. Errors: those of `policy.act`."""
         tick = self._now()
         if self.schedule.wants(tick):
             self._submit(observation, tick)
@@ -214,19 +214,20 @@ class ChunkLoop:
 
     @property
     def stats(self) -> Dict[str, Any]:
-        """Counts since the start: actions, held, chunks, stale (dropped for their age), failed (in all, and by the error's code),
-        limited, refused, human (commanded by a person), missed (periods without a call of `step`), notes; and the delay in steps."""
+        """Counts since the start: actions (commanded by the policy), held, chunks, stale (chunks dropped for their age), failed (in total,
+        and per error code), limited, refused, human (commanded by a person), missed (periods without a call of `step`), notes; and the
+        delay in steps."""
         own = {"missed": self._missed, "notes": self._notes, "delay": self.schedule.delay}
         return {**self.schedule.counts, **self._errors, **own}
 
     def reset(self) -> None:
-        """Begins a new episode. What is still under way is not used."""
+        """Begins a new episode. The result of a running inference is dropped."""
         self._handle = None
         self._forget()
         self.schedule.reset()
 
     def close(self) -> None:
-        """Ends the thread of the loop; the policy stays open, as it was given."""
+        """Ends the loop's thread; the policy stays open."""
         self._handle = None
         if self._worker:
             self._worker.shutdown(wait=False)
@@ -240,7 +241,7 @@ class ChunkLoop:
     # --- inside ----------------------------------------------------------------------------------------------------------------
 
     def _now(self) -> int:
-        """The control period that it is. A caller that is early gets the next one; one that is late has missed some."""
+        """The current control period, always later than the last one: an early call counts for the next period, a late call misses some."""
         now = self._clock()
         if self._start is None:
             self._start = now - (self._tick + 1) / self.rate_hz
@@ -263,7 +264,7 @@ class ChunkLoop:
             self._fail(error)
 
     def _state(self) -> Dict[str, Any]:
-        """What a server's page shows of the loop."""
+        """The state of the loop for the server's page: the fields of a LoopState (src/wire/vla.proto)."""
         stats = self.stats
         counts = {name: stats[name] for name in ("actions", "human", "held", "missed", "limited", "refused")}
         return {"driver": "POLICY" if self.driver is None else "PERSON", **counts}
@@ -273,7 +274,7 @@ class ChunkLoop:
             try:
                 self._handle.result()
             except VlaError:
-                pass  # `_collect` takes it, as in the other mode
+                pass  # `_collect` handles the error, as in the other modes
 
     def _collect(self, tick: int) -> None:
         if self._handle is None or not self._handle.done():
@@ -307,7 +308,7 @@ class ChunkLoop:
 
 
 def _stated(name: str, given: Any, stated: float, bundle: str) -> Any:
-    """What the caller gives, or else what the bundle says: the one and a difference are told. Errors: UsageError where neither says."""
+    """The caller's value, or else the bundle's. Logs a value from the bundle, and a difference. Errors: UsageError if neither has one."""
     if given is None:
         if not stated > 0:
             raise UsageError(name, "a number, since the bundle does not say", "none")
@@ -319,7 +320,7 @@ def _stated(name: str, given: Any, stated: float, bundle: str) -> Any:
 
 
 def _snapshot(value: Any) -> Any:
-    """Arrays are copied: a camera may write its next frame while another thread still reads this one."""
+    """Copies arrays: a camera may write its next frame while another thread still reads this one."""
     if isinstance(value, Mapping):
         return {key: _snapshot(part) for key, part in value.items()}
     return value.copy() if isinstance(value, np.ndarray) or is_pillow(value) else value

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rules of a control loop as a state machine: no clock, no thread, no socket. The same calls give the same actions.
 
-Two counters: a *tick* is a control period; a *step* is a row that was commanded. Rows are counted
-in steps. So the delay of an inference is the number of rows that were commanded while it ran; a robot that held still meanwhile has
-not moved on, and misses no row; and the wait for the very first chunk is no delay at all. Age is counted in ticks.
+There are two counters: ticks count control periods, steps count commanded rows. The delay of an inference is the number of steps while
+it runs. So a robot that holds still meanwhile skips no row, and the wait for the very first chunk is not a delay. Age is counted in ticks.
 """
 
 from __future__ import annotations
@@ -20,23 +19,23 @@ from .blend import Blend, Source
 from .limits import Limiter, finite_row
 
 OnLate = Callable[[Optional[np.ndarray], int], Optional[np.ndarray]]
-N_DELAY = 16  # inferences that an estimate of the delay looks back on
+N_DELAY = 16  # number of latest inferences from which the delay is estimated
 
 
 @dataclass(frozen=True, eq=False)
 class Action:
-    """What to command in one control period.
+    """The command of one control period.
 
-    values   float32 (d_action,) in world units; None: command nothing (before the first chunk)
-    tick     the control period
-    held     no chunk had a row for it: the values are what `on_late` says
-    age      control periods since the oldest observation that contributes; None where held
-    sources  (tick of the observation, weight) of what contributes; the tick is None for the held command in a fade
-    chunk    the newest contributing chunk, as it was received; None where held
-    limited  `max_jump` or a limit cut it
-    clamped  the columns that a limit cut
-    human    a person commanded it (`take_over`)
-    policy   what the policy wanted then, before any limit; None where no chunk had a row
+    values   float32 (d_action,) in world units; None: command nothing (`on_late` returned None, e.g. before the first chunk)
+    tick     number of the control period
+    held     True: no chunk had a row for the step, so the values come from `on_late`
+    age      control periods since the oldest contributing observation; None if held
+    sources  (tick of the observation, weight) of each contributing source; the tick is None for the held command in a fade
+    chunk    the newest contributing chunk, as received; None if held
+    limited  True: `max_jump` or a limit changed the command
+    clamped  the columns that a limit changed
+    human    True: a person's command (`take_over`)
+    policy   if human: the policy's command, before any limit; None if no chunk had a row
     """
 
     values: Optional[np.ndarray]
@@ -52,24 +51,24 @@ class Action:
 
 
 class Flight(NamedTuple):
-    """An observation whose chunk has not come yet."""
+    """An observation whose chunk has not arrived yet."""
 
     step: int
     tick: int
-    is_warm: bool  # there was something to command when it was taken
+    is_warm: bool  # a chunk had rows to command when the observation was taken
 
 
 class ChunkSchedule:
-    """In each control period: `wants`, and then perhaps `observe`; `receive` or `fail` when the answer is there; `next`, once.
+    """Calls in each control period: `wants`, and if it returns True `observe`; `receive` or `fail` when the answer arrives; `next`, once.
 
     horizon, d_action  shape of the chunks
     replan_every       steps from one observation to the next
-    blend              how chunks share a command where they overlap
-    on_late            (last command or None, tick) -> what to command when there is no row
-    max_age            control periods after its observation in which a row may be commanded; None: as long as there are rows
-    max_jump           largest change of each value from one command to the next: a number, or (d_action,); None: any.
-                       What `on_late` says is not limited: a stop must be able to be sudden
-    limiter            keeps every command within limits, those of `on_late` too: then a stop is as fast as they permit
+    blend              weights of overlapping chunks
+    on_late            (last command or None, tick) -> the command when no chunk has a row
+    max_age            most control periods from an observation to a command with its rows; None: no limit
+    max_jump           largest change of each value from one command to the next: a number, or (d_action,); None: no limit.
+                       Commands of `on_late` are not limited by it, so that a stop can be sudden
+    limiter            keeps every command within limits, also those of `on_late`: a stop is then as fast as the limits permit
     """
 
     def __init__(
@@ -97,7 +96,7 @@ class ChunkSchedule:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets everything, as before the first call: an episode begins."""
+        """Begins an episode: resets everything to the state before the first call."""
         self.step = 0
         counts = ("actions", "held", "chunks", "stale", "failed", "limited", "refused", "human")
         self.counts: Dict[str, int] = dict.fromkeys(counts, 0)
@@ -112,11 +111,12 @@ class ChunkSchedule:
 
     @property
     def delay(self) -> Optional[int]:
-        """Steps that the slowest of the last inferences took; None before one that began while there was something to command."""
+        """Delay in steps of the slowest of the last N_DELAY inferences. Only inferences that began with rows to command count; None
+        before the first."""
         return max(self._delays, default=None)
 
     def leftover(self, n_row: int) -> Optional[np.ndarray]:
-        """The next rows of the newest chunk, at most `n_row`, as its network answered them; None where it has none."""
+        """The next rows of the newest chunk, at most `n_row`, as its network computed them (`normalized`); None if there are none."""
         newest = self._sources[-1] if self._sources else None
         if newest is None or newest.chunk is None:
             return None
@@ -125,29 +125,29 @@ class ChunkSchedule:
         return rows if len(rows) else None
 
     def wants(self, tick: int) -> bool:
-        """Whether an observation should be taken now: none is under way, and the newest chunk has been executed for S steps, or there is none."""
+        """Whether to take an observation now: none is pending, and the newest chunk was observed `replan_every` steps ago, or there is none."""
         self._begin(tick)
         if self._flight is not None:
             return False
         return not self._sources or self.step - self._sources[-1].step >= self.replan_every
 
     def observe(self, tick: int) -> None:
-        """An observation was taken and is on its way."""
+        """Records that an observation was taken and sent."""
         self._begin(tick)
         if self._flight is not None:
             raise UsageError("observe", "one observation at a time", "a second one")
         self._flight = Flight(self.step, tick, bool(self._sources))
 
     def fail(self) -> None:
-        """The observation under way will have no chunk."""
+        """Records that the pending observation will have no chunk."""
         self._flight = None
         self.counts["failed"] += 1
 
     def receive(self, chunk: Any, tick: int) -> bool:
-        """The chunk for the observation under way. False: it came too late to be of use, and was dropped.
+        """Adds the chunk of the pending observation. Returns False if it was too late and is dropped.
 
-        Errors: BadAction for a chunk of another shape, or with a number that is not finite, or too many of whose rows break a limit;
-        nothing of it is used.
+        Errors: BadAction for a chunk of another shape, with a number that is not finite, or with too many rows that break a limit;
+        the whole chunk is then dropped.
         """
         self._begin(tick)
         flight, self._flight = self._flight, None
@@ -170,12 +170,12 @@ class ChunkSchedule:
         return True
 
     def next(self, tick: int, human: Any = None) -> Action:
-        """What to command in this control period, which ends with it: the next tick must be a later one.
+        """The command of this control period. Ends the period: the next call needs a later tick.
 
-        human  what a person commands instead, one number for each action. Limits hold for it too
+        human  a person's command, used instead of the policy's, one number for each action. It is kept within the limits too
 
-        Errors: what `on_late` raises, then and from then on: a loop that was stopped goes on after `reset` only. BadAction for a
-        command of a person that is not finite.
+        Errors: those of `on_late`; every later call raises the same error until `reset`. BadAction for a command of a person that is not
+        finite.
         """
         self._begin(tick)
         if self._end:
@@ -200,7 +200,7 @@ class ChunkSchedule:
         return Action(values.copy(), tick, False, max(ages, default=None), sources, chunk, limited, clamped, is_human, wanted if is_human else None)
 
     def hold(self, tick: int) -> Action:
-        """As `next` where no chunk has a row."""
+        """The command of `on_late` for this control period, as `next` gives it if no chunk has a row."""
         self._begin(tick)
         if self._end:
             raise self._end
@@ -208,13 +208,14 @@ class ChunkSchedule:
         return self._hold(tick)
 
     def forget_chunks(self) -> None:
-        """Chunks, and the observation under way, are not used any more. The last command stays, and what comes next fades from it."""
+        """Drops all chunks and the pending observation. Keeps the last command, from which the next chunk fades in."""
         self._sources, self._flight = [], None
 
     # --- inside ----------------------------------------------------------------------------------------------------------------
 
     def _mix(self, parts: List[Tuple[float, Source]]) -> np.ndarray:
-        """The weighted sum of the sources' rows for this step; of a gripper the newest one's value, since half of two decisions is none."""
+        """The weighted sum of the sources' rows for this step; a gripper has the newest source's value, since the mean of two open/close
+        decisions is not a decision."""
         row = sum(w * s.row(self.step).astype(np.float64) for w, s in parts).astype(np.float32)
         return np.where(self._limiter.is_gripper, parts[-1][1].row(self.step), row) if self._limiter else row
 
@@ -222,7 +223,7 @@ class ChunkSchedule:
         if tick <= self._tick:
             raise UsageError("tick", f"later than {self._tick}, which had its action", str(tick))
         self._sources = [s for s in self._sources if self._is_admissible(s.step, s.tick, len(s.rows), tick)]
-        if all(s.tick is None for s in self._sources):  # a held command only fades; it is nothing to go on with
+        if all(s.tick is None for s in self._sources):  # a held command only fades out; alone it is no source
             self._sources = []
 
     def _is_admissible(self, step: int, observed: Optional[int], n_row: int, tick: int) -> bool:
@@ -230,7 +231,8 @@ class ChunkSchedule:
         return is_fresh and self.step < step + n_row
 
     def _make_fade(self, tick: int) -> int:
-        """Steps of a fade that begins now: not more than what fades out has left. After a hold, that is the held command."""
+        """Number of steps of a fade that begins now: at most the rows that the newest source has left. After a hold, the last command is
+        added as a source and fades out."""
         fade = self._blend.fade_steps
         if self._sources:
             newest = self._sources[-1]
@@ -287,7 +289,7 @@ class ChunkSchedule:
 
 
 def late_rule(on_late: Union[str, OnLate], d_action: int, limiter: Optional[Limiter] = None) -> OnLate:
-    """`on_late` of ChunkLoop as a function. "zero" leaves grippers, of which limits tell, as they are."""
+    """`on_late` of ChunkLoop as a function. "zero" keeps the last command of columns that the limits declare as grippers."""
     if callable(on_late):
         return on_late
     if on_late == "hold":

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""vla-limits: a first file of limits for a policy's actions, from what is known of the robot, or the check of a file."""
+"""vla-limits: suggests limits for a policy's actions from data about the robot, or checks a file of limits."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ EPILOG = """examples:
 A first file is a place to start from: read it, and tighten it. Exit codes: 0 done, 2 usage or limits of another robot, 9 a file."""
 CODES = {"usage": 2, "io": 9, "bad_request": 9}
 MAX_URDF = 16 << 20  # bytes
-FEW_VALUES, MANY_COMMANDS = 3, 20  # a column with so few values in so many commands is no joint
-N_STD = 4.0  # of the actions around their mean, where a bundle has no better statistics
+FEW_VALUES, MANY_COMMANDS = 3, 20  # a column with at most 3 values in 20 or more commands is not a joint
+N_STD = 4.0  # standard deviations from the mean to each end of a range, if a bundle has no better statistics
 RADIANS, DEGREES, METRES = ("rad", "radian", "radians"), ("deg", "degree", "degrees"), ("m", "metre", "metres", "meter", "meters")
 
 
@@ -55,7 +55,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def bundle_of(path: Path) -> Tuple[Spec, Dict[str, List[float]]]:
-    """What the runtime says of a bundle: its actions and rate, and the statistics of its training data."""
+    """A bundle's actions and rate, and the statistics of its training data, from `vla inspect`."""
     program = next((each for each in candidates() if each.is_file()), None)
     if program is None:
         raise IoError("vla", " or ".join(map(str, candidates())), "no such file")
@@ -73,7 +73,7 @@ def bundle_of(path: Path) -> Tuple[Spec, Dict[str, List[float]]]:
 
 
 def kinds_of(given: Sequence[str], spec: Spec) -> Dict[str, str]:
-    """The kind of each action. Errors: UsageError for one without, or twice."""
+    """The kind of each action. Errors: UsageError for an action without a kind, or with two."""
     own: Dict[str, str] = {}
     for text in given:
         name, _, kind = text.rpartition("=")
@@ -87,7 +87,7 @@ def kinds_of(given: Sequence[str], spec: Spec) -> Dict[str, str]:
 
 
 def of_urdf(path: Path, spec: Spec, kinds: Mapping[str, str], given: Sequence[str]) -> List[Column]:
-    """The range and the velocity of each action's joint. Errors: IoError, UsageError: a joint that is missing or has no limit."""
+    """The range and the velocity of each action's joint. Errors: IoError; UsageError for a joint that is missing or has no limit."""
     joints = read_urdf(path)
     renamed = dict(_pair("--joint", text) for text in given)
     extra = [name for name in renamed if name not in spec.action_names]
@@ -95,7 +95,7 @@ def of_urdf(path: Path, spec: Spec, kinds: Mapping[str, str], given: Sequence[st
         raise UsageError("--joint", f"actions of {spec.bundle.name}: {', '.join(spec.action_names)}", ", ".join(extra))
     columns = []
     for i, name in enumerate(spec.action_names):
-        if kinds[name] == "gripper" and name not in renamed:  # its opening is rarely in the joint's unit
+        if kinds[name] == "gripper" and name not in renamed:  # the unit of its action is rarely that of the joint
             columns.append(Column(name, "gripper", spec.action_units[i] if spec.action_units else ""))
             continue
         joint = renamed.get(name, name[: -len(".pos")] if name.endswith(".pos") else name)
@@ -107,7 +107,7 @@ def of_urdf(path: Path, spec: Spec, kinds: Mapping[str, str], given: Sequence[st
 
 
 def read_urdf(path: Path) -> Dict[str, Tuple[str, Dict[str, float]]]:
-    """Type and limits of each joint that moves by itself. Errors: IoError for what is no URDF."""
+    """Type and limits of each joint that moves independently. Errors: IoError for a file that is not a URDF."""
     try:
         if not path.is_file() or path.stat().st_size > MAX_URDF:
             raise ValueError(f"no regular file of at most {MAX_URDF} bytes")
@@ -145,7 +145,7 @@ def _column(path: Path, name: str, kind: str, unit: str, joint: Tuple[str, Dict[
 
 
 def of_statistics(stats: Mapping[str, Sequence[float]], spec: Spec, kinds: Mapping[str, str], margin: float) -> Tuple[List[Column], str]:
-    """Ranges, and what they were made of. Errors: UsageError where the bundle has none."""
+    """Ranges from the bundle's statistics, and the names of these statistics. Errors: UsageError if the bundle has none."""
     found = {key.rsplit(".", 1)[-1]: values for key, values in stats.items() if key.startswith("stats.action.") and len(values) == spec.d_action}
     for low, high in (("min", "max"), ("q01", "q99"), ("q02", "q98"), ("q10", "q90")):
         if low in found and high in found:
@@ -164,7 +164,7 @@ def of_statistics(stats: Mapping[str, Sequence[float]], spec: Spec, kinds: Mappi
         grown = (margin - 1) / 2 * (ends[1][i] - ends[0][i])
         low, high = float(ends[0][i] - grown), float(ends[1][i] + grown)
         if kinds[name] != "position":
-            low, high = min(low, 0.0), max(high, 0.0)  # the robot has to be able to stop
+            low, high = min(low, 0.0), max(high, 0.0)  # 0 must be permitted, so that the robot can stop
         columns.append(Column(name, kinds[name], spec.action_units[i] if spec.action_units else "", low, high))
     return columns, told
 
@@ -191,7 +191,7 @@ def suggest(a: argparse.Namespace) -> None:
 
 
 def of_episodes(folder: Path, spec: Spec, kinds: Mapping[str, str], margin: float, refuse_above: float) -> Limits:
-    """The largest of what each episode commanded. Errors: UsageError for episodes of other actions."""
+    """The widest limits over all episodes' commands. Errors: UsageError for episodes of other actions."""
     found: List[Limits] = []
     commands: List[np.ndarray] = []
     for episode in episodes_of(folder):
@@ -207,7 +207,7 @@ def of_episodes(folder: Path, spec: Spec, kinds: Mapping[str, str], margin: floa
 
 
 def _check_joints(folder: Path, spec: Spec, kinds: Mapping[str, str], commands: np.ndarray) -> None:
-    """Errors: UsageError for a position that jumps between a few values, whose velocity would permit any motion."""
+    """Refuses a position that jumps between a few values, since its velocity limit would permit any motion. Errors: UsageError."""
     for i, name in enumerate(spec.action_names):
         values = np.unique(commands[:, i])
         if kinds[name] == "position" and 2 <= len(values) <= FEW_VALUES and len(commands) >= MANY_COMMANDS:
@@ -216,7 +216,7 @@ def _check_joints(folder: Path, spec: Spec, kinds: Mapping[str, str], commands: 
 
 
 def _runs(episode: Episode) -> List[np.ndarray]:
-    """Commands of consecutive periods, where there are four or more."""
+    """The runs of four or more commands in consecutive control periods."""
     ticks, rows = [], []
     for frame in episode:
         if not np.isnan(frame["action"]).any():

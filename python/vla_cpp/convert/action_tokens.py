@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""FAST's tokenizer of actions as the keys `action_tokens.*` of a bundle.
+"""FAST's action tokenizer as the keys `action_tokens.*` of a bundle.
 
-Reference: lerobot policies/pi0_fast/modeling_pi0_fast.py, which reads of the published class its tokenizer, its scale and its min_token;
-transformers 5 looks for the tokenizer in a folder of the parameter's name.
+Reference: lerobot policies/pi0_fast/modeling_pi0_fast.py, which reads only the tokenizer, the scale and the min_token of the published
+class; transformers 5 looks for the tokenizer in a folder named after the class's parameter.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ MAX_TOKENS, MAX_COEFFICIENT = 1 << 20, 10**6
 
 
 class Spoken(NamedTuple):
-    """How actions stand in the language model's answer."""
+    """The form of actions in the language model's answer."""
 
-    skip: int  # ids at the end of its vocabulary that are none of FAST's
+    skip: int  # number of ids at the end of the language model's vocabulary that are not FAST tokens
     required: bool  # an answer must begin with the prefix
 
 
 def read_action_tokens(folder: str, text: TokenizerPlan, n_vocab: int, spoken: Spoken, problems: Problems) -> List[Key]:
-    """The keys, and `solver.stop_token`. `text`: the language model's tokenizer; `n_vocab`: rows of its head. Errors: I/O, bad_bundle."""
+    """The keys `action_tokens.*` and `solver.stop_token`. `text`: the language model's tokenizer; `n_vocab`: rows of the language model's
+    head. Errors: I/O, bad_bundle."""
     if not os.path.isfile(os.path.join(folder, PROCESSOR_FILE)):
         raise refuse(folder, "{} of a FAST tokenizer".format(PROCESSOR_FILE), "none", "give its folder by --action-tokenizer", Code.IO)
     processor = Section(PROCESSOR_FILE, read_json(os.path.join(folder, PROCESSOR_FILE)), DEFAULTS, problems)
@@ -71,7 +72,7 @@ def read_action_tokens(folder: str, text: TokenizerPlan, n_vocab: int, spoken: S
 
 
 def _check_rows(text: TokenizerPlan, n_vocab: int, problems: Problems) -> None:
-    """The reference fails where the network says an id without a token."""
+    """Refuses a head with a row that has no token: the reference fails when the network outputs such an id."""
     hole = next((i for i, token in enumerate(text.tokens) if token == "<no token {}>".format(i)), len(text.tokens))
     if hole < n_vocab:
         problems.unsupported("tokenizer: id {}".format(hole), "a token for each of the {} rows of the head".format(n_vocab), "none")
@@ -91,7 +92,7 @@ def _prefix(text: TokenizerPlan, ids: Dict[str, int], problems: Problems) -> Lis
 
 
 def _vocabulary(folder: str, problems: Problems) -> List[str]:
-    """The texts of FAST's tokens, by id, in the byte-level alphabet; an empty one where an id is none."""
+    """The texts of FAST's tokens by id, in the byte-level alphabet; empty for an id without a token."""
     spec, config = (read_json(os.path.join(folder, name)) for name in (JSON_FILE, CONFIG_FILE))
     where = "action tokenizer: " + JSON_FILE
     model = member(spec, "model", dict, where)
@@ -117,5 +118,6 @@ def _vocabulary(folder: str, problems: Problems) -> List[str]:
 
 
 def _spelt(token: str, symbols: List[str]) -> str:
-    """The decoder takes a token with a character that is no symbol of a byte as it is. Training puts such ones into the vocabulary."""
+    """The token in the byte-level alphabet. Training leaves tokens in the vocabulary with characters outside this alphabet; the decoder
+    copies these tokens literally, so their UTF-8 bytes are encoded here."""
     return token if set(token) <= set(symbols) else "".join(symbols[byte] for byte in token.encode("utf-8", "replace"))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""LoRA adapters of PEFT: read beside the policy that they were trained on, and merged into its tensors as these are streamed.
+"""LoRA adapters of PEFT: read beside their base policy, and merged into its tensors while these are streamed.
 
     W + scale B A,   scale = alpha / r, or alpha / sqrt(r) with use_rslora
 
@@ -25,16 +25,16 @@ from .section import Section
 CONFIG, WEIGHTS_FILE = "adapter_config.json", "adapter_model.safetensors"
 PREFIX = "base_model.model."
 MAX_RANK = 4096
-# Fields of LoraConfig that change the sum of products in another way than this module knows.
+# Fields of LoraConfig that change the sum above in ways that this module does not implement.
 UNREAD = set(
     """
     use_dora use_qalora use_bdlora alora_invocation_tokens arrow_config kasa_config monteclora_config velora_config layer_replication
     target_parameters trainable_token_indices megatron_config ensure_weight_tying
     """.split()
 )
-# Initializations that leave the weights of the base as they are; others (PiSSA, OLoRA, LoftQ, CorDA) take a part out of them.
+# Initializations that leave the base's weights unchanged; others (PiSSA, OLoRA, LoftQ, CorDA) subtract a part from them.
 PLAIN_STARTS = (True, False, None, "gaussian", "eva", "orthogonal")
-# Fields of training and of the library, and those that say which modules have tensors.
+# Fields without effect on the merged weights: of training and of the library, and those that say which modules have tensors.
 IGNORED = set(
     """
     auto_mapping base_model_name_or_path revision inference_mode task_type peft_version lora_dropout target_modules exclude_modules
@@ -46,14 +46,14 @@ KNOWN = {"peft_type", "r", "lora_alpha", "use_rslora", "rank_pattern", "alpha_pa
 
 
 class Factors(NamedTuple):
-    """What is added to a tensor of (rows, ...): left (rows, r) times right (r, the rest)."""
+    """The summand of a tensor (rows, ...): left (rows, r) times right (r, product of the other dimensions)."""
 
     left: np.ndarray
     right: np.ndarray
 
 
 class Merged(NamedTuple):
-    """A tensor of the base with what an adapter adds to it. It has the members of an `Entry`, and gives float32."""
+    """The sum of a base tensor and an adapter's product. Has the members of an `Entry`; its chunks are float32."""
 
     base: Entry
     factors: Factors
@@ -75,10 +75,10 @@ class Merged(NamedTuple):
 
     @property
     def stored(self) -> str:
-        """The type that the policy has in the file, which is that of a bundle unless another one is asked for."""
+        """The base tensor's type in the file, also used in the bundle unless --dtype asks for another."""
         return self.base.dtype
 
-    def __hash__(self) -> int:  # of arrays there is none
+    def __hash__(self) -> int:  # arrays have no hash
         return hash((self.name, self.first))
 
     def rows(self, first: int, count: int) -> Merged:
@@ -91,15 +91,15 @@ class Merged(NamedTuple):
             part = self.base.rows(start, min(n_row, self.shape[0] - start))
             whole = np.concatenate([to_f32(raw, part.dtype) for raw in part.chunks()]).astype(np.float64).reshape(-1, width)
             at = self.first + start
-            with np.errstate(all="ignore"):  # what is not finite is told with the tensor
+            with np.errstate(all="ignore"):  # numbers that are not finite are reported with the tensor
                 yield (whole + self.factors.left[at : at + len(whole)] @ self.factors.right).astype(np.float32).ravel()
 
 
 class Adapter(NamedTuple):
-    """Names are those of the policy's tensors."""
+    """An adapter's tensors, by the names of the policy's tensors."""
 
     factors: Dict[str, Factors]
-    replaced: Dict[str, Entry]  # tensors that were trained as a whole
+    replaced: Dict[str, Entry]  # tensors that were trained in full and replace those of the base
 
     def renamed(self, canonical) -> Adapter:
         return Adapter(
@@ -109,7 +109,7 @@ class Adapter(NamedTuple):
 
 
 def stored_dtype(entry) -> str:
-    """Of a sum or another computed tensor, that of the base's tensor."""
+    """The type of a tensor in the file; for a computed tensor the type of its base tensor."""
     return getattr(entry, "stored", entry.dtype)
 
 
@@ -118,7 +118,7 @@ def is_adapter_name(name: str) -> bool:
 
 
 def base_of(folder: str) -> str:
-    """What adapter_config.json says that it was trained on; empty where that is nothing."""
+    """The base policy that adapter_config.json names; empty if it names none."""
     stated = read_json(os.path.join(folder, CONFIG)).get("base_model_name_or_path")
     return stated if isinstance(stated, str) else ""
 
@@ -132,9 +132,9 @@ def read_adapter(folder: str, problems: Problems) -> Adapter:
 
 
 def parse(config: dict, entries: Dict[str, Entry], problems: Problems, in_bf16: bool = False) -> Adapter:
-    """`entries`: an adapter's tensors, by the names in its file. `in_bf16`: they are rounded first."""
+    """Reads an adapter. `config`: adapter_config.json. `entries`: tensors by their names in the file. `in_bf16`: rounds them to bf16 first."""
     section = _check(config, problems)
-    parts: Dict[str, Dict[str, Entry]] = {}  # module -> what is behind its name
+    parts: Dict[str, Dict[str, Entry]] = {}  # module -> tensors by the rest of their names
     replaced: Dict[str, Entry] = {}
     for stored, entry in entries.items():
         name = stored[len(PREFIX) :] if stored.startswith(PREFIX) else stored
@@ -193,7 +193,7 @@ def _matches(regex: str, module: str, section: Section) -> bool:
 
 
 def _factors(module: str, tensors: Dict[str, Entry], section: Section, problems: Problems, in_bf16: bool) -> Dict[str, Factors]:
-    """Of a linear layer, a convolution or an embedding."""
+    """The factors of a linear layer, a convolution or an embedding, by tensor name."""
     where = "adapter of " + module
     if "magnitude_vector" in tensors:
         hint = "DoRA scales the rows of the sum: merge it with peft (merge_and_unload) and save the policy"
@@ -222,7 +222,7 @@ def _factors(module: str, tensors: Dict[str, Entry], section: Section, problems:
 
 
 def _whole(entry: Entry, in_bf16: bool) -> np.ndarray:
-    """In float64, as a matrix."""
+    """The whole tensor in float64, as a matrix (rows, product of the other dimensions)."""
     values = np.concatenate([to_f32(raw, entry.dtype) for raw in entry.chunks()])
     if in_bf16:
         values = bf16_to_f32(f32_to_bf16(values))
@@ -230,7 +230,7 @@ def _whole(entry: Entry, in_bf16: bool) -> np.ndarray:
 
 
 def merge(tensors: Dict[str, Entry], adapter: Optional[Adapter], notes: List[str], problems: Problems) -> None:
-    """Puts the sums in the place of the base's tensors."""
+    """Replaces the base's tensors by the sums with the adapter's products."""
     if adapter is None:
         return
     for name, entry in adapter.replaced.items():

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tokens of the words that a prompt brings itself, which no instruction changes: they say where its image tokens stand.
+"""Tokenizes the fixed words of a prompt. No instruction changes their tokens, so they determine the positions of the image tokens.
 
-These words are ASCII without digits, so that Qwen2's and Llama 3's expressions can be written with the classes that Python's `re` has.
+These words are ASCII without digits, so that Python's `re` can express the splitting rules of Qwen2 and Llama 3.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ WORDS = re.compile(
 
 
 def special_ids(keys: Sequence[Key], texts: Sequence[str], hint: str, problems: Problems) -> List[int]:
-    """Ids of added tokens that stand for themselves wherever they occur, -1 for what is refused."""
+    """Ids of added tokens that match exactly their text, wherever it occurs. Reports missing tokens, with the id -1, and tokens that
+    take blanks around them."""
     added: Dict[str, dict] = {token["content"]: token for token in json.loads(_value(keys, "tokenizer.added"))}
     for text in texts:
         token = added.get(text)
@@ -33,7 +34,7 @@ def special_ids(keys: Sequence[Key], texts: Sequence[str], hint: str, problems: 
 
 
 def check_undivided(keys: Sequence[Key], own: Sequence[str], texts: Sequence[str], problems: Problems) -> None:
-    """No added token but the prompt's `own` may occur in the words of the prompt."""
+    """Refuses added tokens, except the prompt's `own`, that occur in the fixed words `texts` of the prompt."""
     for token in json.loads(_value(keys, "tokenizer.added")):
         content = token["content"]
         if content not in own and any(content in text for text in texts):
@@ -73,7 +74,7 @@ def merge_all(parts: List[str], ranks: Dict[Tuple[str, ...], int]) -> List[str]:
         rank, at = min((ranks.get(pair, len(ranks)), i) for i, pair in enumerate(pairs))
         if rank == len(ranks):
             break
-        # Every occurrence of the pair merges, from the left.
+        # Merges every occurrence of the pair, from the left.
         pair, merged, i = pairs[at], [], 0
         while i < len(parts):
             step = 2 if tuple(parts[i : i + 2]) == pair else 1

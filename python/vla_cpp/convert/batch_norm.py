@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Convolutions with a frozen batch norm behind them as one convolution with a bias.
+"""Folds a convolution and the frozen batch norm after it into one convolution with a bias.
 
     norm(W x) = (W x - mean) * scale + bias = (scale W) x + (bias - mean * scale),   scale = weight / sqrt(variance + eps)
 
-Computed in float64 and rounded once, so that it differs from the reference, which rounds after each of these steps, by less than the
-reference's own rounding. Reference: torchvision ops/misc.py FrozenBatchNorm2d.
+Computed in float64 and rounded once. The reference rounds after each of these steps; the difference from it is less than its own rounding
+error. Reference: torchvision ops/misc.py FrozenBatchNorm2d.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from .dtypes import to_f32
 from .safetensors_file import Entry
 
-EPS = 1e-5  # of the class
+EPS = 1e-5  # eps of FrozenBatchNorm2d
 PARTS = ("weight", "bias", "running_mean", "running_var")
 
 
@@ -27,9 +27,10 @@ def shapes(name: str, d: int) -> Dict[str, Tuple[int, ...]]:
 
 
 def folded(entry: Entry, name: str, tensors: Mapping[str, Entry]) -> np.ndarray:
-    """Of the convolution's weight (out, in, row, column) the matrix in float32, columns row, column, in; of the norm's bias the bias."""
+    """The folded tensor in float32. For the convolution's weight (out, in, row, column): the matrix (out, row x column x in), flat. For the
+    norm's bias (out,): the folded bias."""
     weight, bias, mean, variance = (whole(tensors["{}.{}".format(name, part)]) for part in PARTS)
-    with np.errstate(all="ignore"):  # what is not finite is reported with the tensor
+    with np.errstate(all="ignore"):  # numbers that are not finite are reported with the tensor
         scale = weight / np.sqrt(variance + EPS)
         if len(entry.shape) == 1:
             return (bias - mean * scale).astype(np.float32)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A streaming writer of bundles (docs/bundle.md) and a reader for tests and tools.
 
-The header states every tensor before the first byte of data is written, so the file grows in one pass and never lies in
-memory. It gets its name when the checksum is in place: a bundle that exists is complete.
+The header describes every tensor before the first byte of data is written, so the file is written in one pass and never held in
+memory. It gets its final name after the checksum is written: an existing bundle is complete.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BUNDLE_VERSION = 1
 CHECKSUM_KEY = "vla.checksum"
 CHECKSUM_ZERO = "xxh3:" + "0" * 16
 HASH_CHUNK = 8 << 20
-# GGUF's numbers of value types, and how a value is packed.
+# GGUF's type number of each value type, and the struct format of a value.
 SCALARS = {"u32": (4, "<I"), "f32": (6, "<f"), "bool": (7, "<?"), "f64": (12, "<d")}
 STRING, ARRAY = 8, 9
 
@@ -39,12 +39,12 @@ class Key(NamedTuple):
 
 
 def keys_by_type(groups: Dict[str, Dict[str, object]]) -> List[Key]:
-    """{type: {name: value}} as keys, in that order."""
+    """Keys from {type: {name: value}}, in the order of the dicts."""
     return [Key(name, kind, value) for kind, group in groups.items() for name, value in group.items()]
 
 
 class TensorInfo(NamedTuple):
-    """A tensor of the bundle: shape as torch has it, dtype f32, bf16, f16, i8 or f64."""
+    """A tensor of the bundle: shape in torch's order of dimensions, dtype f32, bf16, f16, i8 or f64."""
 
     name: str
     shape: Tuple[int, ...]
@@ -90,9 +90,9 @@ def _header(keys: Sequence[Key], tensors: Sequence[TensorInfo]) -> bytes:
 
 
 class BundleWriter:
-    """`with BundleWriter(path, keys, tensors) as out:` and then `out.write(name, array)` in the order of `tensors`, in pieces
-    if one likes. Leaving the block completes the file; an exception removes it. `check`: called with the complete file under its
-    temporary name; its exception removes that too."""
+    """`with BundleWriter(path, keys, tensors) as out:` and then `out.write(name, array)` in the order of `tensors`, whole or in pieces.
+    Leaving the block completes the file; an exception removes it. `check`: called with the temporary path of the complete file; its
+    exception removes the file too."""
 
     def __init__(
         self, path: str, keys: Sequence[Key], tensors: Sequence[TensorInfo], check: Callable[[str], None] = lambda _: None
@@ -100,7 +100,7 @@ class BundleWriter:
         self.path, self.check = path, check
         self.tensors: List[TensorInfo] = list(tensors)
         checksum = Key(CHECKSUM_KEY, "string", CHECKSUM_ZERO)
-        # The checksum stands first, so that the text of its key is found before any vocabulary could contain it.
+        # The checksum comes first, so that a search for its key's text finds it before any vocabulary that contains the same text.
         self.header = _header([checksum, *keys], tensors)
         self.n_bytes = len(self.header) + sum(t.n_bytes + len(_padding(t.n_bytes)) for t in self.tensors)
         self.left = 0
@@ -144,7 +144,7 @@ class BundleWriter:
 
 
 def file_digest(file: BinaryIO, digits: int = -1) -> str:
-    """XXH3-64 of the file in hex. `digits`: where 16 bytes are read as zeros, for a file that carries its checksum."""
+    """XXH3-64 of the file in hex. `digits`: offset of 16 bytes that are hashed as zeros, for a file that contains its own checksum."""
     try:
         import xxhash
     except ImportError:
@@ -165,7 +165,7 @@ def file_digest(file: BinaryIO, digits: int = -1) -> str:
 
 def _check_digest(path: str) -> None:
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        # Behind the key, wherever it is, stand the type (4 bytes), the length (8) and "xxh3:".
+        # The key is followed by the type (4 bytes), the length (8 bytes) and "xxh3:".
         digits = data.find(CHECKSUM_KEY.encode()) + len(CHECKSUM_KEY) + 4 + 8 + len("xxh3:")
         stated, found = data[digits : digits + 16].decode("latin1"), file_digest(file, digits)
     if found != stated:

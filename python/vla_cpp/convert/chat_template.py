@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A chat template, rendered as transformers renders it (utils/chat_template_utils.py), to see which prompt it makes."""
+"""Renders a chat template as transformers does (utils/chat_template_utils.py), to check the prompt that it produces."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAX_TEMPLATE = 1 << 16
 
 
 def find(folder: str) -> Tuple[str, Optional[str]]:
-    """Where the folder states its template, and the template."""
+    """The file that holds the folder's chat template, and the template or None."""
     name = "chat_template.jinja"
     if os.path.exists(os.path.join(folder, name)):
         return name, read_text(os.path.join(folder, name))
@@ -27,7 +27,7 @@ def find(folder: str) -> Tuple[str, Optional[str]]:
 
 
 def user_turn(template: str, where: str, n_view: int, text: str, add_generation_prompt: bool) -> str:
-    """The prompt of one user's turn with so many images and then a text, or how the template fails."""
+    """The prompt of one user turn with `n_view` images followed by a text; if the template fails, a description of the error."""
     try:
         from jinja2 import Undefined
         from jinja2.exceptions import TemplateError
@@ -36,12 +36,12 @@ def user_turn(template: str, where: str, n_view: int, text: str, add_generation_
         raise refuse(where, "the package that renders chat templates", str(error), "pip install jinja2", Code.UNSUPPORTED) from None
 
     class Unstated(Undefined):
-        """A variable that is not given here may be asked for, and not printed."""
+        """An undefined variable: a template may test it, but fails when it prints it."""
 
         __str__ = Undefined._fail_with_undefined_error
 
     environment = ImmutableSandboxedEnvironment(trim_blocks=True, lstrip_blocks=True, undefined=Unstated, extensions=["jinja2.ext.loopcontrols"])
-    del environment.globals["range"]  # a template of someone else's is no place for long loops
+    del environment.globals["range"]  # an untrusted template could loop endlessly over it
     content: List[dict] = [{"type": "image"} for _ in range(n_view)]
     message = {"role": "user", "content": [*content, {"type": "text", "text": text}]}
     try:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A checkpoint folder, opened without reading weights: configs, processors, tensor headers, statistics. The files in the folder say
-whose layout it is: LeRobot's, openpi's, or that of an architecture's authors."""
+"""Opens a checkpoint folder without reading weights: configs, processors, tensor headers, statistics. The files in the folder determine
+its layout: LeRobot's, openpi's, or that of an architecture's authors."""
 
 from __future__ import annotations
 
@@ -23,45 +23,45 @@ from .instead import check_is_policy, instead_of
 from .options import Option
 from .safetensors_file import Entry, read_safetensors
 
-LEROBOT, OPENPI = "lerobot", "openpi"  # layouts; that of an architecture's authors is called as the architecture
-GROOT = "groot"  # LeRobot's type
+LEROBOT, OPENPI = "lerobot", "openpi"  # layouts; a layout of an architecture's authors has the name of the architecture
+GROOT = "groot"  # value of `type` in LeRobot's config of GR00T
 WEIGHTS = "model.safetensors"
 INDEX = WEIGHTS + ".index.json"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-# Commits of the backbones that policies name: where config and tokenizer are to be fetched from if they are not in the checkpoint.
+# Backbones that policies name, with the commit from which to fetch config and tokenizer if the checkpoint lacks them.
 BACKBONES = {"HuggingFaceTB/SmolVLM2-500M-Video-Instruct": "7b375e1b73b11138ff12fe22c8f2822d8fe03467"}
-# Where releases without processor files kept statistics: "<group>.buffer_<feature, dots as underscores>.<statistic>".
+# Groups of statistics in checkpoints without processor files, with tensors "<group>.buffer_<feature, dots as underscores>.<statistic>".
 OLD_GROUPS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.", "unnormalize_targets.")
 MAX_STATISTIC = 1 << 24  # bytes; a statistic has one number per joint, or per pixel channel
 
 
-Tensors = Tuple[Dict[str, Entry], Dict[str, str]]  # by name; a tensor that was not stored because it shares memory -> the one that was
+Tensors = Tuple[Dict[str, Entry], Dict[str, str]]  # tensors by name; aliases: a tensor left out because it shares memory -> the stored one
 
 
 @dataclass
 class Checkpoint:
-    """A policy on disk. `tensors` maps the policy's own names, without what torch.compile adds to them."""
+    """A policy on disk. The names in `tensors` are the policy's own, without the infix of torch.compile."""
 
     name: str
     folder: str
     revision: str
     config: dict
     tensors: Dict[str, Entry]
-    aliases: Dict[str, str]  # as of Tensors
+    aliases: Dict[str, str]  # as in Tensors
     old_statistics: Dict[str, Entry]
     processors: Optional[Tuple[dict, dict]]  # pre and post, None in the older layout
     layout: str = LEROBOT
     notes: List[str] = field(default_factory=list)
-    robot: str = ""  # whose statistics to use, where there are those of several
+    robot: str = ""  # the robot whose statistics to use, if the checkpoint has those of several
     backbone: str = ""  # the repository and commit that --backbone fetched
     base: str = ""  # the folder of the policy that this one, or an adapter, was trained from
     adapter: Optional[Adapter] = None
-    documents: Dict[str, dict] = field(default_factory=dict)  # by name, what stands in the place of JSON files
-    vectors: Any = None  # of LeRobot's GR00T, a robot whose states and actions are one vector each: archs/gr00t/lerobot_files.py
-    degraded: List[str] = field(default_factory=list)  # features that pass unnormalized because --identity-stats allows it
+    documents: Dict[str, dict] = field(default_factory=dict)  # by file name: contents used instead of the JSON file
+    vectors: Any = None  # for LeRobot's GR00T: a robot whose states and actions are one vector each (archs/gr00t/lerobot_files.py)
+    degraded: List[str] = field(default_factory=list)  # features that stay unnormalized because --identity-stats allows it
 
     def path(self, name: str) -> str:
-        """Of an adapter what its folder does not have is the base's."""
+        """The path of a file; if the folder lacks the file, its path in the base's folder."""
         own = os.path.join(self.folder, name)
         return os.path.join(self.base, name) if self.base and not os.path.exists(own) else own
 
@@ -98,7 +98,7 @@ def read_stored(folder: str, problems: Problems) -> Tensors:
     aliases: Dict[str, str] = {}
     for file in _weight_files(folder, problems):
         content = read_safetensors(os.path.join(folder, file))
-        # Every key of the metadata that names a stored tensor as its value is a shared tensor that was left out.
+        # A metadata key whose value is the name of a stored tensor is a shared tensor that was left out.
         aliases.update({clean(k): clean(v) for k, v in content.metadata.items() if v in content.entries})
         for stored, entry in content.entries.items():
             name = clean(stored)
@@ -109,15 +109,15 @@ def read_stored(folder: str, problems: Problems) -> Tensors:
 
 
 class Layout(NamedTuple):
-    """How a checkpoint is saved, and how it is recognized."""
+    """How checkpoints of one layout are saved and recognized."""
 
-    name: str  # whose it is, as in "a checkpoint of ..."
-    options: Tuple[Option, ...]  # what such a checkpoint leaves open, of what others state or do not have
-    model_types: Tuple[str, ...] = ()  # what config.json states as model_type
-    keys: Tuple[str, ...] = ()  # of config.json, any of which tells it from others with its model_type
-    value: Tuple[str, Tuple[str, ...]] = ("", ())  # a key of config.json and its values, any of which tells it from all others
-    files: Tuple[str, ...] = ()  # any of them tells it, where config.json does not, or names several; names or patterns
-    read: Callable[[str, Problems], Tensors] = read_stored  # tensors of the folder, and those that share the memory of one
+    name: str  # owner of the layout, to complete "a checkpoint of ..."
+    options: Tuple[Option, ...]  # options for facts that these checkpoints do not state
+    model_types: Tuple[str, ...] = ()  # values of model_type in config.json
+    keys: Tuple[str, ...] = ()  # keys of config.json; any one identifies the layout among those with the same model_type
+    value: Tuple[str, Tuple[str, ...]] = ("", ())  # a key of config.json and its values, any of which identifies the layout
+    files: Tuple[str, ...] = ()  # file names or patterns; any one identifies the layout if config.json does not decide
+    read: Callable[[str, Problems], Tensors] = read_stored  # reads the folder's tensors and aliases
     about: str = ""  # a paragraph of `vla-convert --help`
     has_config: bool = True  # whether there is a config.json
 
@@ -143,13 +143,13 @@ def _read_processors(folder: str) -> Optional[Tuple[dict, dict]]:
 
 
 def open_checkpoint(source: str, authors: Mapping[str, Layout], base: str = "") -> Checkpoint:
-    """A folder, or a repository as hub_folder() reads it. `authors`: layouts by architecture. `base`: what an adapter was trained on, by
-    --base. Errors: usage, io, bad_bundle."""
+    """Opens a folder, or a repository in the form of hub_folder(). `authors`: layouts by architecture. `base`: value of --base, the policy
+    that an adapter was trained on. Errors: usage, io, bad_bundle."""
     name, folder, revision = _opened(source)
     check_is_policy(folder)
     sizes = _opened(base) if base and states_no_sizes(folder) else None
-    below = None if sizes else _base_of(folder, base)  # where the weights are
-    # openpi's training writes no config.json, its converter from JAX one without a type.
+    below = None if sizes else _base_of(folder, base)  # the policy with the weights
+    # openpi's training writes no config.json; its converter from JAX writes one without a type.
     has_assets = any(os.path.isdir(os.path.join(folder, name)) for name in ("assets", "params"))
     own = folder if os.path.exists(os.path.join(folder, "config.json")) or not below else below.folder
     has_config = os.path.exists(os.path.join(own, "config.json"))
@@ -178,13 +178,13 @@ def open_checkpoint(source: str, authors: Mapping[str, Layout], base: str = "") 
 
 
 def states_no_sizes(folder: str) -> bool:
-    """Whether it is a policy whose config leaves the sizes of its network to that of its base: LeRobot's GR00T."""
+    """Whether the config omits the sizes of the network, which only the base's config states: LeRobot's GR00T."""
     path = os.path.join(folder, "config.json")
     return os.path.exists(path) and read_json(path).get("type") == GROOT
 
 
 class Opened(NamedTuple):
-    """A repository or the name of a folder, the folder, and the commit of a repository."""
+    """An opened source. name: of the repository or folder; folder: its path; revision: commit of the repository, else empty."""
 
     name: str
     folder: str
@@ -199,7 +199,7 @@ def _opened(source: str) -> Opened:
 
 
 def _base_of(folder: str, given: str) -> Optional[Opened]:
-    """The policy that a folder is an adapter of; None for a policy with all of its weights. Errors: usage, io, unsupported."""
+    """The base policy of the adapter in a folder; None if the folder has all of the policy's weights. Errors: usage, io, unsupported."""
     is_adapter = os.path.exists(os.path.join(folder, ADAPTER_CONFIG))
     is_whole = any(os.path.exists(os.path.join(folder, name)) for name in (WEIGHTS, INDEX))
     if given and not is_adapter:
@@ -227,7 +227,7 @@ def _uses_adapter(folder: str) -> bool:
 
 
 def _adapter_inside(folder: str, tensors: Dict[str, Entry], problems: Problems) -> Optional[Adapter]:
-    """Of weights that were saved with their adapter, as PEFT's modules hold both; these become the base's alone."""
+    """The adapter in weights that PEFT saved together with the base's; None if there is none. Leaves only the base's in `tensors`."""
     own = {name: tensors.pop(name) for name in list(tensors) if is_adapter_name(name)}
     for name in [name for name in tensors if ".base_layer." in name]:
         tensors[name.replace(".base_layer.", ".")] = tensors.pop(name)
@@ -241,12 +241,12 @@ def _adapter_inside(folder: str, tensors: Dict[str, Entry], problems: Problems) 
     return parse(read_json(path), own, problems)
 
 
-# What wrappers put in front of all names of a module: torch's for several GPUs, its compiler, and a class around the policy.
+# Prefixes that wrappers add to all names of a module: torch's wrapper for several GPUs, torch.compile, and PEFT's class.
 WRAPPERS = ("module.", "_orig_mod.", "base_model.model.")
 
 
 def without_prefix(tensors: Dict[str, Entry], aliases: Dict[str, str], layout: str, notes: List[str]) -> Tensors:
-    """Names without a prefix that stands in front of all of them and is no part of the policy's own."""
+    """Removes from all names a common prefix that is not part of the policy's own names."""
     cut = ""
     while tensors:
         own = "model." if layout not in (LEROBOT, OPENPI) else "model.model."
@@ -262,8 +262,8 @@ def without_prefix(tensors: Dict[str, Entry], aliases: Dict[str, str], layout: s
 
 
 def of_model_type(config: dict, folder: str, authors: Mapping[str, Layout]) -> str:
-    """The architecture that config.json's model_type names, of several the one whose value it has, otherwise one whose keys it has, of these
-    the one whose files the folder has; empty where it names none."""
+    """The architecture with config.json's model_type; empty if there is none. Among several it is the first whose `value` matches; else one
+    whose `keys` occur, preferably with its `files` in the folder; else the first."""
     found = [arch for arch, layout in authors.items() if config.get("model_type") in layout.model_types]
     told = [arch for arch in found if config.get(authors[arch].value[0]) in authors[arch].value[1]]
     own = [arch for arch in found if any(key in config for key in authors[arch].keys)]
@@ -271,7 +271,7 @@ def of_model_type(config: dict, folder: str, authors: Mapping[str, Layout]) -> s
 
 
 def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, Layout]) -> str:
-    """LeRobot's config states a type and features, and none of the others does."""
+    """The layout's name. Only LeRobot's config states a type and features."""
     if "type" in config or "input_features" in config:
         return LEROBOT
     stated = of_model_type(config, folder, authors)
@@ -284,7 +284,7 @@ def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, L
 
 
 def given_backbone(checkpoint: Checkpoint, given: str) -> str:
-    """The folder that --backbone means, empty without one. Errors: io."""
+    """The folder that --backbone names, downloaded if it is on the hub; empty without the option. Errors: io."""
     hub = hub_folder(given, BACKBONE_PATTERNS)
     if hub:
         checkpoint.backbone = "{}@{}".format(hub.repo, hub.commit)
@@ -296,7 +296,7 @@ def given_backbone(checkpoint: Checkpoint, given: str) -> str:
 
 
 def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_model_name", own: str = "vlm") -> str:
-    """The folder with the backbone's config.json: as given, `own` inside the checkpoint."""
+    """The folder with the backbone's config.json: the given one, else `own` inside the checkpoint."""
     if given:
         return given
     inside = checkpoint.path(own)
@@ -313,7 +313,7 @@ def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_mod
 
 
 def _backbone_hint(named) -> str:
-    """A checkpoint may come from anyone, so that no folder of this machine is read because its config names it."""
+    """A hint for a missing backbone. A checkpoint may come from anyone, so a folder that its config names is read only on --backbone."""
     if isinstance(named, str) and named in BACKBONES:
         return "run vla-convert again with --backbone hub:{}@{}".format(named, BACKBONES[named])
     if isinstance(named, str) and os.path.isabs(named):
@@ -322,7 +322,7 @@ def _backbone_hint(named) -> str:
 
 
 def read_statistic(entry: Entry) -> np.ndarray:
-    """A small tensor as float32, as the reference loads statistics."""
+    """A statistic as float32, the type in which the reference loads it."""
     if entry.dtype not in STATISTICS or entry.n_bytes > MAX_STATISTIC:
         raise refuse(
             "{}: tensor {}".format(entry.path, entry.name), "a statistic in F32", "{} bytes of {}".format(entry.n_bytes, entry.dtype)

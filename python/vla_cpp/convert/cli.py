@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `vla-convert`: arguments in, exit code out; decides nothing about numbers."""
+"""The command `vla-convert`: parses arguments and returns the exit code; it makes no decision about numbers."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _merged(helps: Dict[str, str]) -> str:
-    """ "openpi: ...; GR00T N1.6, GR00T N1.7: ..." of the help of each layout."""
+    """One help text, "openpi: ...; GR00T N1.6, GR00T N1.7: ...", from the help of each layout."""
     layouts: Dict[str, List[str]] = {}
     for layout, text in helps.items():
         layouts.setdefault(text, []).append(layout)
@@ -77,7 +77,7 @@ def _merged(helps: Dict[str, str]) -> str:
 
 @contextmanager
 def _progress(quiet: bool):
-    """A bar on stderr while it is a terminal; nothing otherwise, so that logs stay readable."""
+    """A progress bar if stderr is a terminal; nothing otherwise, so that logs stay readable."""
     if quiet or not sys.stderr.isatty():
         yield lambda *_: None
         return
@@ -91,7 +91,7 @@ def _progress(quiet: bool):
 
 
 def report(summary: Summary) -> str:
-    """The summary as text, a line per fact."""
+    """The summary as text, one line per fact."""
     lines = [
         "wrote {}: {}, {} tensors, {}, {:,} bytes".format(
             summary.path, summary.arch, summary.n_tensor, summary.codes or summary.dtype, summary.n_bytes
@@ -130,7 +130,7 @@ def main(argv=None) -> int:
         print("error: " + missing_extra(str(error.name)).message(), file=sys.stderr)
         return int(Code.USAGE)
     except KeyboardInterrupt:
-        return 130  # what shells report for an interrupt; the unfinished file is gone
+        return 130  # the exit code of shells for an interrupt; the unfinished file is removed
     except Exception as error:  # noqa: BLE001 - the user gets one line and an exit code for bugs too
         print(
             "error: vla-convert: {}: {}; this is a fault of the converter, please report it".format(

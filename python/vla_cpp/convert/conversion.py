@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""From an opened checkpoint to a written bundle: match tensors, choose a dtype, stream, report."""
+"""Converts an opened checkpoint into a bundle: matches tensors, chooses a dtype, streams, reports."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from .safetensors_file import Entry
 from .ternary import quantize as quantize_ternary
 from .units import add_units
 
-Progress = Callable[[str, int, int], None]  # what is being written, bytes done, bytes in all
+Progress = Callable[[str, int, int], None]  # (name of what is written, bytes written, total bytes)
 
 
 @dataclass
 class Summary:
-    """What a person should know afterwards."""
+    """Results of a conversion that the user should know."""
 
     path: str
     arch: str
     dtype: str
-    codes: str = ""  # int8 or int4, where `vla quantize` made some of matrices of that dtype
+    codes: str = ""  # int8 or int4, if `vla quantize` quantized the matrices of that dtype
     n_tensor: int = 0
     n_bytes: int = 0
     dropped: Dict[str, List[str]] = field(default_factory=dict)  # reason -> tensors
     notes: List[str] = field(default_factory=list)
     rounding: Tuple[float, str] = (0.0, "")  # largest |stored - original| and its tensor
-    ternary: Tuple[float, str] = (1.0, "")  # smallest distance of a number from where its code changes, and its tensor
+    ternary: Tuple[float, str] = (1.0, "")  # smallest distance of a number from a threshold of its code, and its tensor
 
 
 def convert_checkpoint(source: str, out: str, options: Options, force: bool = False, progress: Progress = lambda *_: None) -> Summary:
-    """Writes `out` or raises ConvertError and leaves nothing behind."""
+    """Writes `out`; if it fails, raises ConvertError and leaves no file behind."""
     _check_out(out, force)
     if options.dtype in CODES:
         return _convert_to_codes(source, out, options, force, progress)
@@ -80,7 +80,7 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
 
 
 def _convert_to_codes(source: str, out: str, options: Options, force: bool, progress: Progress) -> Summary:
-    """By way of a bundle of the stored floats, which lies beside `out` meanwhile."""
+    """Converts to a temporary bundle of floats in a folder beside `out`, then quantizes it."""
     vla = program(options.vla)
     beside = None if is_special(out) else os.path.dirname(os.path.realpath(out))
     with tempfile.TemporaryDirectory(dir=beside, prefix=".vla-convert-") as folder:
@@ -108,7 +108,8 @@ def _check_state_bound(options: Options) -> None:
 
 
 def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, List[str]]:
-    """Compares what the configs ask for with what the file has: every missing, extra and misshapen tensor in one report."""
+    """Compares the tensors that the configs require with those of the file; reports all missing, extra and misshapen ones together.
+    Returns the dropped tensors by reason."""
     expected = {weight.source: weight.stored for weight in plan.weights}
     for weight in plan.weights:
         if weight.batch_norm:
@@ -133,7 +134,7 @@ def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, 
 
 
 def _check_dropped(source: str, entry, shape, problems: Problems) -> None:
-    """Of any dtype: counters are whole numbers."""
+    """Checks only the shape: a dropped tensor may have any dtype, e.g. an integer counter."""
     if entry.shape != shape:
         problems.add("tensor " + source, str(shape), str(entry.shape))
 
@@ -152,8 +153,8 @@ def _check_entry(source: str, entry, shape, plan: Plan, problems: Problems) -> N
 
 
 def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
-    """As asked; else the stored one when all matrices that it is for share it; else f32, which holds every stored number.
-    For `stored` the narrower one, beside which matrices of float32 stay so."""
+    """The dtype of the matrices: the wanted one; else the stored dtype if all matrices share it; else f32, which is exact for every stored
+    number. For `stored` and mixed types: the narrower dtype; float32 matrices stay float32."""
     if wanted not in ("", STORED):
         return wanted
     stored = Counter(
@@ -184,7 +185,7 @@ def _tensor_dtype(weight: Weight, stored: str, dtype: str) -> str:
 
 
 def _opener(vla: str, silent: bool, out: str, plan: Plan, summary: Summary) -> Callable[[str], None]:
-    """Opens the complete file with `vla`, and notes unless `silent` that it could not."""
+    """A function that opens the complete file with `vla`. If `vla` cannot, it adds a note, unless `silent`."""
     robots = next((list(key.value) for key in plan.keys if key.name == "embodiments"), [])
 
     def open_it(part: str) -> None:
@@ -221,7 +222,7 @@ def _write(
 
 
 def _pieces(entry: Entry, weight: Weight) -> Iterator[np.ndarray]:
-    """The numbers of a row of the mapping in the bundle's order, in pieces; what is rearranged comes whole."""
+    """The numbers of one row of the mapping, in the bundle's order, in pieces; a rearranged tensor is a single piece."""
     if weight.first is not None:
         entry = entry.rows(weight.first, weight.shape[0])
     if weight.pick is None and not weight.transpose and not weight.regroup and not weight.axes:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Several robots of a checkpoint in one bundle: what they share is stored once, what differs under each robot's tag."""
+"""Puts several robots of a checkpoint into one bundle: shared parts are stored once, differing parts under each robot's tag."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from .checkpoint import Checkpoint
 from .errors import Code, ConvertError, Problems, refuse
 
 ALL = "all"
-OWN_OPTIONS = ("variant", "gripper_sign", "camera_size", "dataset_info")  # of which each robot may have its own
+OWN_OPTIONS = ("variant", "gripper_sign", "camera_size", "dataset_info")  # options that may differ between robots
 
 
 def plan_robots(module: Any, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    """`module`: of the architecture. Each robot's part is what a conversion for it alone writes. Errors: usage, and those of the plans."""
+    """The plan for all chosen robots; each robot's part equals a conversion for this robot alone. `module`: of the architecture. Errors:
+    usage, and those of the module's plans."""
     tags = _tags(module, checkpoint, options)
     if len(tags) == 1:
         return module.plan(checkpoint, options_of(tags[0], tags, options), problems)
     plans = [_plan(module, checkpoint, options_of(tag, tags, options), problems) for tag in tags]
-    checkpoint.notes[:] = dict.fromkeys(checkpoint.notes)  # each plan makes those of the checkpoint
+    checkpoint.notes[:] = dict.fromkeys(checkpoint.notes)  # every robot's plan repeats the checkpoint's notes
     return merge(tags, plans)
 
 
@@ -38,13 +39,13 @@ def _tags(module: Any, checkpoint: Checkpoint, options: Options) -> List[str]:
 
 
 def options_of(tag: str, tags: Sequence[str], options: Options) -> Options:
-    """What one of the robots is converted with. Errors: usage."""
+    """The options for converting one of the robots. Errors: usage."""
     own = {name: _value_of(tag, tags, name, getattr(options, name)) for name in OWN_OPTIONS}
     return options.replaced(embodiment=tag, **own)
 
 
 def _value_of(tag: str, tags: Sequence[str], name: str, given: str) -> str:
-    """A value for all robots, or TAG=VALUE,... for those that are named."""
+    """The robot's value of an option, given as one value for all robots or as TAG=VALUE,... for some. Errors: usage."""
     if given.partition("=")[0] not in tags or "=" not in given:
         return given
     pairs = [part.partition("=") for part in given.split(",")]
@@ -56,7 +57,7 @@ def _value_of(tag: str, tags: Sequence[str], name: str, given: str) -> str:
 
 
 def _plan(module: Any, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    """The plan of one of several robots, whose refusal names it."""
+    """The plan of one of several robots; a refusal names the robot."""
     try:
         return module.plan(checkpoint, options, problems)
     except ConvertError as error:
@@ -65,7 +66,7 @@ def _plan(module: Any, checkpoint: Checkpoint, options: Options, problems: Probl
 
 
 def merge(tags: Sequence[str], plans: Sequence[Plan]) -> Plan:
-    """A bundle of several robots: a key or tensor that is the same for all of them is stored once."""
+    """The plan of a bundle with several robots: a key or tensor that is the same for all robots is stored once."""
     keys = _merged(tags, [{key.name: key for key in plan.keys} for plan in plans])
     weights = _merged(tags, [{weight.target: weight for weight in plan.weights} for plan in plans])
     return Plan(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Typed refusals: the same classes, exit codes and wording as the C++ runtime (src/base/result.h)."""
+"""Errors of a conversion, with the same classes, exit codes and wording as the C++ runtime (src/base/result.h)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import List, NamedTuple
 
 from ..printable import printable
 
-MAX_LINES = 50  # of a report: who has more problems than these gave the wrong checkpoint
+MAX_LINES = 50  # lines of a report; more problems mean that the checkpoint is the wrong one
 
 
 class Code(enum.IntEnum):
@@ -18,12 +18,12 @@ class Code(enum.IntEnum):
     INTERNAL = 1
     USAGE = 2
     BAD_BUNDLE = 3  # the checkpoint is damaged, incomplete or contradicts itself
-    UNSUPPORTED = 6  # the checkpoint may be fine, but asks for something that the runtime does not do
+    UNSUPPORTED = 6  # the checkpoint may be valid, but needs something that the runtime does not support
     IO = 9
 
 
 class Problem(NamedTuple):
-    """Where it was, what was expected, what was found, and the next move if there is one."""
+    """An error: where it is, what was expected, what was found, and what to do next, if known."""
 
     where: str
     expected: str
@@ -32,13 +32,13 @@ class Problem(NamedTuple):
     code: Code = Code.BAD_BUNDLE
 
     def message(self) -> str:
-        """One line, whatever a file's names and values hold."""
+        """The error in one line, also if names and values from a file contain line ends."""
         text = "{}: expected {}, found {}".format(self.where, self.expected, self.found)
         return printable(text) + ("; " + printable(self.hint) if self.hint else "")
 
 
 class ConvertError(Exception):
-    """A refusal with one or several problems, all of which are shown at once."""
+    """A refusal with one or several problems, all shown together."""
 
     def __init__(self, problems: List[Problem], subject: str = "") -> None:
         self.problems = list(problems)
@@ -65,7 +65,7 @@ def refuse(where: str, expected: str, found: str, hint: str = "", code: Code = C
 
 
 class Problems:
-    """Collects what is wrong, so that a person reads one complete report instead of one refusal per attempt."""
+    """Collects problems, so that the user gets one complete report instead of one refusal per attempt."""
 
     def __init__(self, subject: str) -> None:
         self.subject = subject

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of the numbers of states and actions, and the control rate, from a LeRobot data set's meta/info.json where there is one."""
+"""Names of the numbers in states and actions, and the control rate, from a LeRobot data set's meta/info.json if it is given."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def robot_keys(
     max_tokens: Optional[int] = None,
     states: Optional[Dict[str, int]] = None,
 ) -> List[Key]:
-    """Views, states and actions. `dims`: widths of vectors. `max_tokens`: of text, where no other key of the plan states them. `states`:
-    where the bundle has other ones than the data set."""
+    """Keys of views, states and actions. `dims`: widths of the data set's vectors. `max_tokens`: most tokens of text, if no other key of the
+    plan states it. `states`: widths of the bundle's states, if they differ from the data set's."""
     tokens = [] if max_tokens is None else [Key("observation.max_text_tokens", "u32", max_tokens)]
     return [*views, *states_of(states or dims), *tokens, *feature_keys(info_path, dims, notes, problems)]
 
@@ -41,13 +41,13 @@ def views_of(views: Sequence[str], aliases: Sequence[str], optional: Sequence[in
 
 
 def states_of(dims: Dict[str, int]) -> List[Key]:
-    """`dims`: widths of vectors; that of the action is left out."""
+    """Keys of the states. `dims`: widths of vectors; the action is left out."""
     states = {feature: dim for feature, dim in dims.items() if feature != ACTION}
     return [Key("observation.states", "string[]", list(states)), Key("observation.state_dims", "u32[]", list(states.values()))]
 
 
 def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problems: Problems) -> List[Key]:
-    """Without a data set the names are generated and the rate is 0, which the runtime reads as unstated."""
+    """Keys of names and rate. Without a data set, names are generated and the rate is 0, which the runtime treats as unstated."""
     info = read_json(info_path) if info_path else {}
     if info_path:
         _check_info(info, info_path, dims, problems)
@@ -69,7 +69,7 @@ def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problem
 
 
 def _check_info(info: dict, path: str, dims: Dict[str, int], problems: Problems) -> None:
-    """Whether it is a data set's meta/info.json, and of this robot."""
+    """Checks that the file is a data set's meta/info.json and belongs to this robot."""
     features = member(info, "features", dict, path)
     if not any(feature in features for feature in dims):
         hint = "give meta/info.json of the data set that the policy was trained on"
@@ -100,7 +100,8 @@ def _names(info: dict, path: str, feature: str, dim: int, notes: List[str], prob
 
 
 def _stated_names(feature) -> Optional[list]:
-    """The spellings of data sets: a list, an object around one list ({"motors": [...]}), or an object from name to index."""
+    """Names of a feature's numbers, or None. Data sets store them as a list, as an object around one list ({"motors": [...]}), or as an
+    object from name to index."""
     names = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(names, dict) and names and all(isinstance(index, int) for index in names.values()):
         return sorted(names, key=names.get) if sorted(names.values()) == list(range(len(names))) else list(names.values())

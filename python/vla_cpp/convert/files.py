@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a checkpoint, read with refusals that name the file."""
+"""Reads files of a checkpoint; errors name the file."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ..installed import extra_hint
 from ..strict_json import no_constant
 from .errors import Code, ConvertError, refuse
 
-MAX_JSON = 256 << 20  # the tokenizers of the largest vocabularies take some 20 MB
+MAX_JSON = 256 << 20  # bytes; the largest tokenizers have about 20 MB
 
 
 def open_file(path: str) -> BinaryIO:
-    """A regular file, for reading: a pipe would be waited for, and a device has no end. Errors: io."""
+    """Opens a regular file for reading. Refuses a pipe, which would block, and a device, which may have no end. Errors: io."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # opening a pipe waits for its writer
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # O_NONBLOCK: opening a pipe does not wait for its writer
     except OSError as error:
         raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -41,7 +41,7 @@ def read_file(path: str, max_bytes: int = MAX_JSON) -> bytes:
 
 
 def read_text(path: str) -> str:
-    """The same of a file in UTF-8."""
+    """The text of a UTF-8 file. Errors: io, bad_bundle."""
     try:
         return read_file(path).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -49,7 +49,7 @@ def read_text(path: str) -> str:
 
 
 def read_json(path: str) -> dict:
-    """A JSON object. Errors: io when it cannot be read, bad_bundle when it is something else."""
+    """The JSON object in a file. Errors: io when the file cannot be read, bad_bundle when it holds anything else."""
     data = read_file(path)
     try:
         value = json.loads(data.decode("utf-8"), parse_constant=no_constant)
@@ -64,7 +64,7 @@ KINDS = {dict: "a JSON object", list: "a list", str: "a string"}
 
 
 def member(value: dict, key: str, kind: type, where: str):
-    """A member of a JSON object that is an object, a list or a string; an absent one is empty. Errors: bad_bundle."""
+    """A member of a JSON object, of type `kind` (dict, list or str); an absent member is an empty one. Errors: bad_bundle."""
     found = value.get(key)
     if found is None:
         return kind()

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Repositories of the hub, in the cache of huggingface_hub.
+"""Downloads repositories of the hub into the cache of huggingface_hub.
 
-The library asks the hub, carries the token and follows redirects. What the hub answers becomes names and paths here, and is checked before:
-commits, digests and file names. A file that was cut off is continued by the next run, and its name in the cache is its digest, so that whole
-files alone have one.
+The library sends the requests with the user's token and follows redirects. This module makes paths from the hub's answers, so it first
+checks commits, digests and file names. The next run continues an interrupted download. A file is renamed to its digest only when it is
+complete.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ HUB = "hub:"
 HUB_FORM = "hub:OWNER/NAME@REVISION"
 HUB_NAME = r"\w[\w.-]*/\w[\w.-]*"
 MAX_NAME = 512  # characters of OWNER/NAME@REVISION
-MAX_FILES = 100_000  # of a repository
+MAX_FILES = 100_000  # files in a repository
 
 
 class HubFolder(NamedTuple):
-    """A repository of the hub in the local cache, and the commit that its revision was when it was asked for."""
+    """A repository of the hub in the local cache. commit: the commit that the revision named when it was fetched."""
 
     folder: str
     repo: str
@@ -67,8 +67,8 @@ class HubFolder(NamedTuple):
 
 
 def hub_folder(source: str, patterns: Sequence[str], again: bool = False) -> Optional[HubFolder]:
-    """None for a source that is a folder. Nothing is ever downloaded that does not say so, revision included. `again`: files that are there
-    already are compared with their digests. Errors: usage, io."""
+    """The repository of a source hub:OWNER/NAME@REVISION, downloaded if missing; None for any other source, which is a folder. Without
+    this form, revision included, nothing is downloaded. `again`: compares cached files with their digests. Errors: usage, io."""
     if not source.startswith(HUB):
         return None
     found = re.fullmatch(r"({})@(\w[\w.-]*(?:/\w[\w.-]*)*)".format(HUB_NAME), source[len(HUB) :][: MAX_NAME + 1], re.ASCII)
@@ -80,7 +80,7 @@ def hub_folder(source: str, patterns: Sequence[str], again: bool = False) -> Opt
 
 
 def fetched(source: str, repo: str, revision: str, patterns: Sequence[str], again: bool = False) -> str:
-    """The folder with the repository's files of these patterns, downloaded where they are not yet."""
+    """The folder with the repository's files that match the patterns, downloaded if missing."""
     try:
         import huggingface_hub
         import huggingface_hub.utils
@@ -104,7 +104,7 @@ def fetched(source: str, repo: str, revision: str, patterns: Sequence[str], agai
 
 
 def _shown(record: logging.LogRecord) -> bool:
-    """What the library logs may have the hub's words in it."""
+    """Makes a log message printable: the library's messages may contain text from the hub."""
     record.msg, record.args = printable(record.getMessage()), ()
     return True
 
@@ -117,7 +117,7 @@ def _cached(hub: Any, repo: str, revision: str, patterns: Sequence[str], unreach
 
 
 class _File(NamedTuple):
-    """A file of a repository. Large ones have the SHA-256 of their bytes as their name, others the one that git gives them."""
+    """A file of a repository. digest: for large files the SHA-256 of the bytes, for others git's blob hash."""
 
     path: str
     size: int
@@ -150,7 +150,7 @@ def _listing(hub: Any, repo: str, revision: str, patterns: Sequence[str]) -> _Li
 
 
 def _file(repo: str, entry: Any) -> _File:
-    """Errors: io, where a name would leave the folder or act on a terminal, or a digest is none."""
+    """A file from the hub's list. Errors: io for a name that leaves the folder or contains control characters, and for an invalid digest."""
     parts = entry.path.split("/")
     if not all(plain_name(part) and part == printable(part) and len(part) < 256 for part in parts):
         raise refuse(repo, "files with plain names", repr(entry.path)[:200], "the hub's answer is not used", Code.IO)
@@ -163,7 +163,7 @@ def _file(repo: str, entry: Any) -> _File:
 
 
 def _download(hub: Any, repo: str, revision: str, listing: _Listing, again: bool) -> str:
-    """Blobs first, then the folder of links to them, and the name of the revision last: what has a name is whole."""
+    """Downloads the blobs, then makes the folder of links to them, and writes the revision's name last: a named revision is complete."""
     cache = Path(hub.constants.HF_HUB_CACHE) / "models--{}".format(repo.replace("/", "--"))
     blobs, snapshot = cache / "blobs", cache / "snapshots" / listing.commit
     blobs.mkdir(parents=True, exist_ok=True)
@@ -188,7 +188,7 @@ def _download(hub: Any, repo: str, revision: str, listing: _Listing, again: bool
 
 
 class _Part(io.FileIO):
-    """A file that grows up to a size: a hub that sends more does not fill the disk."""
+    """A file with a size limit, so that a hub that sends too much cannot fill the disk."""
 
     def __init__(self, path: Path, limit: int) -> None:
         super().__init__(path, "ab")
@@ -205,7 +205,8 @@ class _Part(io.FileIO):
 
 @contextlib.contextmanager
 def _held(path: Path, limit: int) -> Iterator[_Part]:
-    """The file to be continued, for one program at a time: another one that waited finds it gone, and a new one in its place."""
+    """Opens the partial file and locks it for this program. If another program finished the file during the wait for the lock, opens a
+    new one."""
     while True:
         with _Part(path, limit) as part:
             fcntl.flock(part, fcntl.LOCK_EX)
@@ -215,12 +216,12 @@ def _held(path: Path, limit: int) -> Iterator[_Part]:
 
 
 def _fetch(hub: Any, url: str, file: _File, blob: Path) -> None:
-    """Continues where an earlier run ended. Errors: io."""
+    """Downloads a file, continuing an interrupted download. Errors: io."""
     from huggingface_hub.file_download import http_get
 
     path = blob.with_name(blob.name + ".part")
     with _held(path, file.size) as part:
-        if blob.exists():  # another program was quicker
+        if blob.exists():  # another program has finished the download
             path.unlink()
             return
         if part.tell() > file.size:
@@ -236,7 +237,7 @@ def _fetch(hub: Any, url: str, file: _File, blob: Path) -> None:
 
 
 def _remove_stale(blobs: Path) -> None:
-    """What is left of files that earlier runs began and no revision asks for any more."""
+    """Removes partial files of earlier runs that no running program holds."""
     for path in blobs.glob("*.part"):
         with open(path, "rb") as part, contextlib.suppress(OSError):
             fcntl.flock(part, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels that a policy normalizes: by statistics of its cameras, or by those of ImageNet whatever the data."""
+"""Normalization of pixels, by statistics of the policy's cameras or by those of ImageNet."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 from .errors import Problems
 from .normalization import Normalization
 
-MIN_SPREAD = 1e-6  # that the recipe divides by
+MIN_SPREAD = 1e-6  # smallest divisor in the recipe
 IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 
 
 def standardized(views: Sequence[Tuple[str, Normalization]], problems: Problems) -> List[dict]:
-    """Ops on pixels in [0, 1]; views share one where their statistics are the same. Ranges become -1 to 1.
+    """Recipe ops that normalize pixels in [0, 1]; views with the same statistics share one op. Min/max ranges are mapped to [-1, 1].
     Reference: lerobot processor/normalize_processor.py, in float32."""
     ops, seen = [], []
     for i, (name, norm) in enumerate(views):
@@ -34,7 +34,7 @@ def standardized(views: Sequence[Tuple[str, Normalization]], problems: Problems)
 
 
 def offset_and_spread(norm: Normalization) -> Tuple[np.ndarray, np.ndarray]:
-    """What is subtracted, and what is divided by."""
+    """The number to subtract and the divisor, per channel."""
     first, second = (value.astype(np.float32).ravel() for value in norm.statistics.values())
     if norm.kind == "mean_std":
         return first, second + np.float32(norm.eps)

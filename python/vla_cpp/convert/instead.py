@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a source that is no policy was probably meant to be, and what to give instead."""
+"""Hints for a source that is not a policy: what the user probably meant, and what to give instead."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .errors import Code, refuse
 from .hub import HUB_NAME
 
 POLICY = "pretrained_model"  # where LeRobot's training saves a policy
-# Below the folder of a checkpoint, of a run, and of runs by name or by date and time.
+# Parent folders of POLICY below a given folder, which may be a checkpoint, a run, or a folder of runs by name or by date and time.
 BELOW = ("", "last", "*", "checkpoints/last", "checkpoints/*", "*/checkpoints/last", "*/*/checkpoints/last")
 
 
 def instead_of(source: str) -> str:
-    """The hint for a source that is no folder."""
+    """The hint for a source that is not a folder."""
     if source.endswith(".gguf"):
         return "a bundle is converted already: vla run takes it"
     if os.path.isfile(source):
@@ -26,7 +26,7 @@ def instead_of(source: str) -> str:
 
 
 def check_is_policy(folder: str) -> None:
-    """Refuses a folder that has policies only further down. Errors: io."""
+    """Refuses a folder whose policies are only in subfolders. Errors: io."""
     names = [name for name in ("model.safetensors", "model.safetensors.index.json", "assets", "params", "adapter_config.json") if _has(folder, name)]
     if _has(folder, "config.json") or names:
         return
@@ -41,7 +41,7 @@ def _has(folder: str, name: str) -> bool:
 
 
 def _policies_below(folder: str) -> list:
-    """The nearest ones; of numbered checkpoints the last."""
+    """The policies at the nearest level below a folder; among numbered checkpoints only the last."""
     for below in BELOW:
         pattern = os.path.join(glob.escape(folder), *below.split("/"), POLICY, "config.json")
         found = sorted(os.path.dirname(file) for file in glob.glob(pattern))

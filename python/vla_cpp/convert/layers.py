@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of mappings: single tensors, and the blocks that architectures share, each written once with its shapes. A mapping says what a
-checkpoint calls their parts."""
+"""Rows of mappings, with shapes: single tensors, and blocks that several architectures share. Each mapping gives a checkpoint's names for
+the parts of a block."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def linear(target: str, source: str, d_out: int, d_in: int, bias: bool = True) -
 
 
 def ternary(target: str, source: str, d_out: int, d_in: int, bias: bool = True) -> Rows:
-    """A matrix that the reference rounds to -1, 0 and 1 times a factor, four numbers in a byte."""
+    """A matrix that the reference rounds to -1, 0 or 1 times a factor; stored with four numbers per byte."""
     rows = [
         Weight(target + ".weight", source + ".weight", TERNARY, (d_out, d_in), (d_out, d_in // 4)),
         Weight(target + ".scale", source + ".weight", SCALE, (d_out, d_in), (1,)),
@@ -31,7 +31,7 @@ def vector(target: str, source: str, size: int, stored: Tuple[int, ...] = (), **
 
 
 def table(target: str, source: str, n_row: int, d: int, stored: Tuple[int, ...] = (), **how) -> Rows:
-    """`source`: the whole name; the reference's own parameters do not end in "weight"."""
+    """A table. `source`: the full tensor name, since names of plain parameters do not end in "weight"."""
     return [Weight(target + ".weight", source, TABLE, stored or (n_row, d), (n_row, d), **how)]
 
 
@@ -48,15 +48,20 @@ def gemma_norm(target: str, source: str, d: int) -> Rows:
 
 
 def patch_embed(source: str, d: int, size: int) -> Rows:
-    """A convolution whose stride is its kernel is a matrix over the flattened patch: channel, row, column."""
+    """The patch embedding: a convolution whose stride equals its kernel size is a matrix over the flattened patch (channel, row, column)."""
     stored, at = (d, 3, size, size), "vision.patch_embed"
     return [Weight(at + ".weight", source + ".weight", MATRIX, stored, (d, 3 * size**2)), *vector(at + ".bias", source + ".bias", d)]
 
 
 class Names(NamedTuple):
-    """What a checkpoint calls the parts of a block, with blanks between them. `attn`: q, k, v and the projection behind them; or, where the
-    rows of q, k and v are stacked, their name up to "weight" or "bias", and the projection. `ffn`: up, down. `cross`: a second attention.
-    `norms`: one for each of these in turn, if they have any; `scales`, of LayerScale, too."""
+    """A checkpoint's names for the parts of a block, separated by blanks.
+
+    attn    q, k, v and the output projection; if q, k and v are stacked in one tensor: its name up to "weight" or "bias", and the projection
+    ffn     up, down
+    cross   a second attention
+    norms   the norms of attention, of cross-attention if there is one, and of the MLP; empty without norms
+    scales  the LayerScale factors, in the same order; empty without them
+    """
 
     attn: str
     ffn: str
@@ -69,7 +74,7 @@ SIGLIP = Names("self_attn.q_proj self_attn.k_proj self_attn.v_proj self_attn.out
 
 
 def attention(target: str, source: str, names: str, d: int, d_in: int = 0, product=linear) -> Rows:
-    """`d_in`: width of what keys and values are made from, d by default."""
+    """An attention. `d_in`: width of the input of keys and values, by default d."""
     *qkv, out = names.split()
     if len(qkv) == 1:
         rows = stacked(target, source + qkv[0], d)
@@ -80,7 +85,7 @@ def attention(target: str, source: str, names: str, d: int, d_in: int = 0, produ
 
 
 def stacked(target: str, source: str, d: int) -> Rows:
-    """q, k and v of width d as thirds of the rows of one matrix and one bias."""
+    """q, k and v of width d, which are stacked as the thirds of one matrix's and one bias's rows."""
     rows: Rows = []
     for i, part in enumerate(("attn_q", "attn_k", "attn_v")):
         rows += [
@@ -91,7 +96,7 @@ def stacked(target: str, source: str, d: int) -> Rows:
 
 
 def block(target: str, source: str, names: Names, d: int, d_ff: int, d_in: int = 0, product=linear) -> Rows:
-    """Attention, or self-attention and cross-attention, and an MLP."""
+    """A block: self-attention, cross-attention if `names.cross` is set, and an MLP."""
     (up, down), norms, scales = names.ffn.split(), names.norms.split(), names.scales.split()
     parts = [("attn", attention(target, source, names.attn, d, d_in, product))]
     if names.cross:
@@ -106,19 +111,19 @@ def block(target: str, source: str, names: Names, d: int, d_ff: int, d_in: int =
 
 
 def blocks(target: str, source: str, names: Names, n_layer: int, d: int, d_ff: int, product=linear) -> Rows:
-    """`source`: with {} for the number of the layer, up to the dot."""
+    """Blocks of all layers. `source`: prefix up to the dot, with {} for the layer's number."""
     layers = ((target + "blk.{}.".format(i), source.format(i)) for i in range(n_layer))
     return [row for at, theirs in layers for row in block(at, theirs, names, d, d_ff, product=product)]
 
 
 class Decoder(NamedTuple):
-    """In what the blocks of Llama, Qwen, Gemma and BitNet differ."""
+    """The differences between the blocks of Llama, Qwen, Gemma and BitNet."""
 
     norm: Callable[..., Rows] = rms_norm
     product: Callable[..., Rows] = linear
     qkv_bias: bool = False
-    sub_norms: bool = False  # in front of the last product of attention and of the MLP
-    head_norms: bool = False  # of queries and keys
+    sub_norms: bool = False  # norms before the last product of attention and of the MLP
+    head_norms: bool = False  # norms of queries and keys, per head
 
 
 LLAMA, GEMMA, QWEN2, QWEN3 = Decoder(), Decoder(gemma_norm), Decoder(qkv_bias=True), Decoder(head_norms=True)
@@ -126,7 +131,8 @@ BITNET = Decoder(product=ternary, sub_norms=True)
 
 
 def gated_block(target: str, source: str, d: int, d_ff: int, heads: Sequence[int], kind: Decoder = LLAMA, d_in: int = 0) -> Rows:
-    """`heads`: widths of queries, of keys, of a head. `d_in`: width of what keys and values are made from, d by default."""
+    """A decoder block with a gated MLP. `heads`: widths of queries, of keys and of a head. `d_in`: width of the input of keys and values, by
+    default d."""
     (d_q, d_kv, d_head), at, mlp, rows = (
         heads,
         source + "self_attn.",

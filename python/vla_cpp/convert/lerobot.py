@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the checkpoints of all LeRobot policies have in common: keys of config.json, features, views, where the tokenizer is."""
+"""The common parts of all LeRobot checkpoints: keys of config.json, features, views, the tokenizer's folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EMPTY_CAMERA = "observation.images.empty_camera_"
 MAX_DIM, MAX_EMPTY = 1 << 16, 64
 RTC_CONFIG = {"execution_horizon": 10, "prefix_attention_schedule": "LINEAR", "max_guidance_weight": 10.0}  # defaults of LeRobot's class
 RTC_SCHEDULES = ("ZEROS", "ONES", "LINEAR", "EXP")
-# Keys that no number of an action chunk depends on.
+# Keys without effect on the numbers of an action chunk.
 IGNORED = set(
     """
     type input_features output_features normalization_mapping rtc_config device use_amp push_to_hub repo_id
@@ -29,7 +29,7 @@ IGNORED = set(
     scheduler_decay_lr compile_model compile_mode use_peft
     """.split()
 )
-# Keys whose other values ask for something that the runtime does not do.
+# Keys with the only value that the runtime supports, and the reason.
 FIXED = {"n_obs_steps": (1, "the reference reads one observation")}
 
 
@@ -51,7 +51,7 @@ def check_keys(policy: Section, name: str, known: Set[str], fixed: Dict[str, Tup
 
 
 def _sound_rtc(rtc) -> bool:
-    """Without rows of a chunk before the reference computes the same, whether it is enabled or not."""
+    """Whether an rtc_config is valid. Its `enabled` does not matter: without rows of a previous chunk the reference computes the same."""
     if not isinstance(rtc, dict):
         return rtc is None
     horizon, schedule, weight = (rtc.get(key, default) for key, default in RTC_CONFIG.items())
@@ -60,7 +60,7 @@ def _sound_rtc(rtc) -> bool:
 
 
 def run_keys(checkpoint: Checkpoint, views: Sequence[str]) -> List[Key]:
-    """How the checkpoint is run: what changes no number of a chunk, but what a robot does with it."""
+    """Keys of how the checkpoint is run. They change no number of a chunk, only what a robot does with it."""
     config, keys = checkpoint.config, []
     steps, rtc = config.get("n_action_steps"), config.get("rtc_config")
     if type(steps) is int and 0 < steps <= MAX_DIM:
@@ -80,7 +80,7 @@ def run_keys(checkpoint: Checkpoint, views: Sequence[str]) -> List[Key]:
 
 
 def no_position_rule(policy: Section, options: Options, problems: Problems) -> None:
-    """Of an architecture whose position rows are those of its patches. Errors: usage."""
+    """Refuses --position-precision for an architecture with one position row per patch. Errors: usage."""
     if options.position_precision:
         found = "type {}".format(policy.get("type"))
         problems.add("--position-precision", "a SmolVLA checkpoint", found, "leave the option out", Code.USAGE)
@@ -91,7 +91,7 @@ def _features(policy: Section, key: str) -> dict:
 
 
 def listed_views(policy: Section, others: Callable[[str, object], None]) -> List[str]:
-    """Names of the cameras that the config lists, in their order. `others`: what to say of further features, by name and type."""
+    """Names of the cameras that the config lists, in order. `others`: called with name and type of each feature of another kind."""
     views = []
     for name, feature in _features(policy, "input_features").items():
         kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
@@ -105,18 +105,18 @@ def listed_views(policy: Section, others: Callable[[str, object], None]) -> List
 
 
 def read_views(policy: Section, checkpoint: Checkpoint) -> Tuple[List[str], int]:
-    """Names of the cameras in their order, and how many of them `empty_cameras` adds."""
+    """Names of the cameras in order, and the number of them that `empty_cameras` adds."""
     n_empty, note = policy.count("empty_cameras", 0, MAX_EMPTY), "input feature {} ({}): not read by this policy".format
     views = listed_views(policy, lambda name, kind: checkpoint.notes.append(note(name, kind)))
     if not views:
         policy.bad("input_features", "a VISUAL feature or several", "none")
-    # The reference's config class adds these itself (validate_features), to whatever the file lists.
+    # The reference's config class adds these to the listed ones (validate_features).
     added = [EMPTY_CAMERA + str(i) for i in range(n_empty)]
     return views + [name for name in added if name not in views], n_empty
 
 
 def strict_views(policy: Section) -> List[str]:
-    """Names of the cameras, where what the reference does not read is refused: it may be a misspelt feature."""
+    """Names of the cameras. Refuses features that the reference does not read, since they may be misspelt."""
     expected = "cameras and {}".format(recipe.STATE)
     views = listed_views(policy, lambda name, kind: policy.bad("input_features." + name, expected, str(kind), unsupported=True))
     if not views:
@@ -135,13 +135,13 @@ def vector_dim(policy: Section, key: str, name: str, kind: str) -> int:
 
 
 def state_width(policy: Section, checkpoint: Checkpoint, options: Options, padded: bool = True) -> int:
-    """Of a fine-tune the feature may still be that of the base. The reference never looks at it where it pads the state, but its statistics
-    must have the robot's width."""
+    """Width of the state. The config of a fine-tune may still state the base's width: the reference never reads it if it pads the state
+    (`padded`), but the statistics must have the robot's width."""
     return _width(policy, checkpoint, options, "input_features", recipe.STATE, "STATE", padded)
 
 
 def action_width(policy: Section, checkpoint: Checkpoint, options: Options) -> int:
-    """Where the feature contradicts the statistics the reference cannot un-normalize, so that nobody but the user knows."""
+    """Width of the action. If the config contradicts the statistics, the reference fails to unnormalize, so only the user can decide."""
     return _width(policy, checkpoint, options, "output_features", recipe.ACTION, "ACTION", False)
 
 
@@ -152,7 +152,7 @@ def _width(policy: Section, checkpoint: Checkpoint, options: Options, key: str, 
     stated = vector_dim(policy, key, name, kind) if name in _features(policy, key) else "none"
     if stated == found:
         return found
-    if found == 1 and not options.widths:  # which the reference spreads over a state of any width
+    if found == 1 and not options.widths:  # the reference broadcasts one number over a vector of any width
         return vector_dim(policy, key, name, kind)
     text = "{} has {} numbers, as its statistics do, and not the {} of config.json: {}"
     checkpoint.notes.append(text.format(name, found, stated, "--widths config would follow that" if follows else "--widths statistics"))
@@ -160,7 +160,7 @@ def _width(policy: Section, checkpoint: Checkpoint, options: Options, key: str, 
 
 
 def check_widths(policy: Section, widths: Dict[str, Tuple[int, int]]) -> None:
-    """`widths`: key of the padded width -> (padded, the feature's)."""
+    """Checks that padded widths suffice. `widths`: config key of the padded width -> (padded width, the feature's width)."""
     for key, (padded, real) in widths.items():
         if real > padded:
             policy.bad(key, "at least the feature's width {}".format(real))
@@ -170,8 +170,8 @@ def check_widths(policy: Section, widths: Dict[str, Tuple[int, int]]) -> None:
 
 
 def view_keys(checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems) -> List[Key]:
-    """One view must be present. The cameras that `empty_cameras` adds to the features stand in no data set, so nobody need declare
-    them absent."""
+    """Keys of the views, of which one must be present. Cameras that `empty_cameras` adds are in no data set, so they are optional: nobody
+    needs to declare them absent."""
     empty = [view for view in views if view.startswith(EMPTY_CAMERA)]
     if empty:
         checkpoint.notes.append("views that stay empty unless a frame is given: " + ", ".join(empty))
@@ -180,14 +180,14 @@ def view_keys(checkpoint: Checkpoint, views: Sequence[str], processors: recipe.P
 
 
 def required_view_keys(checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems) -> List[Key]:
-    """Of a policy whose reference needs every view."""
+    """Keys of the views for a policy whose reference needs every view."""
     aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
     return [*views_of(views, aliases, [0] * len(views), len(views)), *run_keys(checkpoint, views)]
 
 
 def tokenizer_folder(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:
-    """The tokenizer that the checkpoint brings: the one that its processor declares, or that lies there while --backbone names no
-    other; empty when there is none."""
+    """The folder of the checkpoint's own tokenizer: the one that the processor names, else tokenizer/ if it exists and --backbone is not
+    given; else empty."""
     own = processors.own_tokenizer or ("" if options.backbone else "tokenizer")
     if not own or not (processors.own_tokenizer or os.path.exists(checkpoint.path(own))):
         return ""
@@ -196,7 +196,8 @@ def tokenizer_folder(checkpoint: Checkpoint, options: Options, processors: recip
 
 
 def given_tokenizer(checkpoint: Checkpoint, options: Options, processors: recipe.Processors, name: str) -> str:
-    """The checkpoint's own, or that of --backbone, where no config says which it is. `name`: that of the reference. Errors: I/O."""
+    """The folder of the checkpoint's own tokenizer or of --backbone, for a policy whose config names none. `name`: the reference's
+    tokenizer. Errors: I/O."""
     found = tokenizer_folder(checkpoint, options, processors) or options.backbone
     if found:
         return found

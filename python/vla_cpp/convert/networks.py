@@ -13,7 +13,7 @@ from .layers import LLAMA, SIGLIP, Decoder, Rows, blocks, gated_block, linear, n
 from .section import Section
 
 MAX_LAYERS = 1024
-NORM_EPS = 1e-5  # of torch.nn.LayerNorm
+NORM_EPS = 1e-5  # default eps of torch.nn.LayerNorm
 
 
 @dataclass
@@ -49,13 +49,13 @@ class Language:
 
     @property
     def heads(self) -> Tuple[int, int, int]:
-        """Widths of queries, of keys, of a head."""
+        """Widths of queries, of keys and of a head."""
         return self.n_head * self.d_head, self.n_head_kv * self.d_head, self.d_head
 
 
 @dataclass
 class TextEncoder:
-    """Keys `lm.*` of BERT and BART."""
+    """Keys `lm.*` for BERT and BART."""
 
     d_model: int = 0
     n_layer: int = 0
@@ -79,7 +79,7 @@ def kind_of(key: str, value: object) -> str:
 
 
 def keys_of(*parts: Mapping[str, Fields]) -> List[Key]:
-    """Numbers, names and lists of modules, by type. `parts`: fields by module."""
+    """Keys "module.field" with the type of each value. `parts`: fields by module."""
     groups: Dict[str, Dict[str, object]] = {kind: {} for kind in ("u32", "f32", "f64", "string", "u32[]", "string[]")}
     for module, fields in (item for part in parts for item in part.items()):
         for name, value in (fields if isinstance(fields, Mapping) else vars(fields)).items():
@@ -89,7 +89,7 @@ def keys_of(*parts: Mapping[str, Fields]) -> List[Key]:
 
 
 def pick(sizes: object, names: str) -> Dict[str, object]:
-    """Some of the attributes, by name."""
+    """The attributes with these names, separated by blanks, as a dict."""
     return {name: getattr(sizes, name) for name in names.split()}
 
 
@@ -97,12 +97,12 @@ SIZES = ("hidden_size", "intermediate_size", "num_hidden_layers", "num_attention
 
 
 def defaults(*sizes: int, **others: object) -> Dict[str, object]:
-    """Of a config class of transformers. `sizes`: those of SIZES."""
+    """The defaults of a config class of transformers. `sizes`: values of the fields in SIZES."""
     return {**dict(zip(SIZES, sizes)), **others}
 
 
 def read_vision(section: Section, image_size: int, patch_size: int) -> Vision:
-    """Field names of transformers' vision configs."""
+    """Reads a config with the field names of transformers' vision configs."""
     vision = Vision(
         d_model=section.count("hidden_size"),
         n_layer=section.count("num_hidden_layers", maximum=MAX_LAYERS),
@@ -118,7 +118,8 @@ def read_vision(section: Section, image_size: int, patch_size: int) -> Vision:
 
 
 def read_language(section: Section) -> Language:
-    """Field names of transformers' text configs; `rope_base` is the caller's. A null num_key_value_heads means num_attention_heads."""
+    """Reads a config with the field names of transformers' text configs; the caller sets `rope_base`. A null num_key_value_heads means
+    num_attention_heads."""
     n_head, d_model = section.count("num_attention_heads"), section.count("hidden_size")
     section.defaults.setdefault("num_key_value_heads", n_head)
     if "num_key_value_heads" in section.values:
@@ -137,14 +138,14 @@ def read_language(section: Section) -> Language:
 
 
 def check_heads(section: Section, lm: Language) -> None:
-    """Heads must share the width evenly, and be pairs for the rotary embedding."""
+    """Checks that the heads divide the width, and that a head's width is even, as the rotary embedding needs."""
     if lm.d_model % lm.n_head or lm.n_head % lm.n_head_kv or lm.d_model // lm.n_head % 2:
         expected = "heads of an even width that divide hidden_size {}, in whole groups".format(lm.d_model)
         section.bad("num_attention_heads", expected)
 
 
 def pooling_head(tower: str, vision: Vision, reason: str) -> List[Dropped]:
-    """Of a SigLIP tower, which no policy reads. `tower`: where it stands, up to the dot."""
+    """The pooling head of a SigLIP tower, which no policy reads. `tower`: the tower's prefix, up to the dot."""
     d = vision.d_model
     shapes = {"probe": (1, 1, d), "attention.in_proj_weight": (3 * d, d), "attention.in_proj_bias": (3 * d,)}
     for name, d_out, d_in in (("attention.out_proj", d, d), ("mlp.fc1", vision.d_ff, d), ("mlp.fc2", d, vision.d_ff)):
@@ -154,7 +155,7 @@ def pooling_head(tower: str, vision: Vision, reason: str) -> List[Dropped]:
 
 
 def siglip(source: str, v: Vision, n_position: int = 0, product=linear, post_norm: bool = True) -> Rows:
-    """The tower below `source`, which ends in a dot, as `vision.*`. `product`: the kind of its blocks' matrices."""
+    """The tower with the prefix `source`, which ends in a dot, as `vision.*`. `product`: function for the matrices of the blocks."""
     return [
         *patch_embed(source + "embeddings.patch_embedding", v.d_model, v.patch_size),
         *table("vision.position", source + "embeddings.position_embedding.weight", n_position or v.n_patch, v.d_model),
@@ -163,13 +164,13 @@ def siglip(source: str, v: Vision, n_position: int = 0, product=linear, post_nor
     ]
 
 
-# Of the last layer of a prefix only keys and values are read.
+# Tensors of the last layer that are read if only its keys and values are used, as in a prefix.
 KEPT_OF_LAST = ("attn_norm.weight", "attn_k.weight", "attn_v.weight")
 
 
 def decoder(lm: Language, source: str, kind: Decoder = LLAMA, end: str = "norm", tokens: str = "") -> Rows:
-    """The language model below `source`, which ends in a dot. `end`: "norm"; "layers", without it; "cache", where only keys and values are
-    read, so that the last layer needs no more. `tokens`: the whole name of the embedding, where it stands elsewhere."""
+    """The language model with the prefix `source`, which ends in a dot, as `lm.*`. `end`: "norm"; "layers", without the final norm; "cache",
+    for a prefix: the last layer has only its keys and values. `tokens`: full name of the embedding, if it has another prefix."""
     rows = table("lm.token_embd", tokens or source + "embed_tokens.weight", lm.n_vocab, lm.d_model)
     for i in range(lm.n_layer):
         own = _layer(lm, source, i, kind)
@@ -182,7 +183,7 @@ def _layer(lm: Language, source: str, i: int, kind: Decoder = LLAMA) -> Rows:
 
 
 def dropped_of_last(lm: Language, source: str) -> List[Dropped]:
-    """What `decoder` leaves out of a prefix."""
+    """The tensors that `decoder` leaves out with end="cache"."""
     reason = "the last language layer leaves only keys and values"
     rest = [row for row in _layer(lm, source, lm.n_layer - 1) if not row.target.endswith(KEPT_OF_LAST)]
     return [
@@ -192,8 +193,8 @@ def dropped_of_last(lm: Language, source: str) -> List[Dropped]:
 
 
 def expert(source: str, d: int, d_ff: int, lm: Language, kind: Decoder = LLAMA, d_in: Sequence[int] = ()) -> Rows:
-    """The layers below `source`, which ends in a dot, that attend together with those of a language model, as `expert.*`. `d_in`: by layer
-    the width of what keys and values are made from, d by default."""
+    """The action expert with the prefix `source`, which ends in a dot, as `expert.*`; its layers attend jointly with those of the language
+    model `lm`. `d_in`: per layer the width of the input of keys and values, by default d."""
     rows: Rows = []
     for i, width in enumerate(d_in or [d] * lm.n_layer):
         rows += gated_block("expert.blk.{}.".format(i), "{}layers.{}.".format(source, i), d, d_ff, lm.heads, kind, width)

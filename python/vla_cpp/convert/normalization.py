@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of features: where a checkpoint keeps them, which of them a mode reads, and what they must look like.
+"""Statistics of features: where a checkpoint stores them, which ones a normalization mode reads, and which values are valid.
 
 Reference: lerobot src/lerobot/processor/normalize_processor.py and migrate_policy_normalization.py.
 """
@@ -16,8 +16,8 @@ from .checkpoint import Checkpoint, read_statistic
 from .errors import Code, Problems
 from .safetensors_file import read_safetensors
 
-BUFFER = ".buffer."  # between a data set and a feature
-# Normalization mode -> the recipe's kind and the statistics that its formula reads.
+BUFFER = ".buffer."  # separates data set and feature in a tensor's name
+# Normalization mode -> the recipe's kind, and the statistics that its formula reads.
 MODES = {
     "IDENTITY": ("identity", ()),
     "MEAN_STD": ("mean_std", ("mean", "std")),
@@ -32,7 +32,7 @@ WIDTHS = "config.json's feature says the first; where that is out of date, --wid
 
 @dataclass
 class Normalization:
-    """What happens to one feature: the formula, the reference's epsilon, and its statistics by name."""
+    """The normalization of one feature: kind of formula, the reference's epsilon, and statistics by name."""
 
     kind: str = "identity"
     eps: float = 1e-8
@@ -45,16 +45,21 @@ class Normalization:
 
 
 class Found(NamedTuple):
-    """Statistics of one feature by name, and all features that the same place has statistics of."""
+    """Statistics of one feature by name. features: all features with statistics in the same file or group."""
 
     values: Dict[str, np.ndarray]
     features: List[str]
-    robot: str = ""  # whose, where --stats chose them
+    robot: str = ""  # the data set that --stats chose
 
 
 class Context(NamedTuple):
-    """What is asked of statistics: widths by feature, and the features that may do without. `min_widths`: widths of statistics that need
-    not reach the padded width. `degraded`: of the latter those that need it."""
+    """Requirements for statistics.
+
+    dims        widths by feature
+    identity    features that may be without statistics (--identity-stats)
+    degraded    receives the features that have none and stay unnormalized
+    min_widths  smallest widths by feature, where statistics may be narrower than the padded width in `dims`
+    """
 
     dims: Dict[str, int]
     identity: Sequence[str]
@@ -65,7 +70,7 @@ class Context(NamedTuple):
 
 
 def choose(feature: str, mode: str, eps: float, found: Found, context: Context) -> Normalization:
-    """The normalization of one feature with its statistics checked, or the identity that was asked for."""
+    """The normalization of one feature, with checked statistics; the identity if the mode or --identity-stats says so."""
     problems, dim = context.problems, context.dims[feature]
     if not isinstance(mode, str) or mode not in MODES:
         problems.unsupported("normalization of " + feature, " or ".join(MODES), str(mode))
@@ -74,7 +79,7 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
     if not names:
         return Normalization()
     missing = [name for name in names if name not in found.values]
-    own = found.robot and not found.values  # what the data set that --stats chose has none of, passes as in the reference
+    own = found.robot and not found.values  # the data set of --stats has no statistics: identity, as in the reference
     if missing and (feature in context.identity or own):
         why = "--stats {} has none".format(found.robot) if own else "--identity-stats allows it"
         context.degraded.append(feature)
@@ -95,7 +100,7 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
 
 
 def _plain(value: np.ndarray) -> np.ndarray:
-    """Statistics of pixels are stored as (3, 1, 1), to be broadcast over images."""
+    """The statistic as a vector: those of pixels are stored as (3, 1, 1) to be broadcast over images."""
     return value.ravel() if value.shape == (3, 1, 1) else value
 
 
@@ -119,8 +124,8 @@ def _check_statistic(where: str, name: str, value: np.ndarray, widths: Tuple[int
 
 
 def from_file(path: str, feature: str, checkpoint: Checkpoint, problems: Problems) -> Found:
-    """Statistics as a processor step stores them, "<feature>.<statistic>". LeRobot's migration of a policy that was trained on several data
-    sets left "<data set>.buffer.<feature>.<statistic>" for each, which LeRobot itself does not find."""
+    """Statistics in a processor step's file, named "<feature>.<statistic>". For a policy that was trained on several data sets, LeRobot's
+    migration stores "<data set>.buffer.<feature>.<statistic>" per data set, which LeRobot itself does not find."""
     entries = read_safetensors(path).entries
     features = sorted({name.rsplit(".", 1)[0] for name in entries})
     prefix, own = feature + ".", ""
@@ -134,8 +139,8 @@ def from_file(path: str, feature: str, checkpoint: Checkpoint, problems: Problem
 
 
 def from_weights(checkpoint: Checkpoint, feature: str, problems: Problems) -> Found:
-    """Statistics as the older layout has them among the weights; groups that hold the same statistic must agree. Policies that were
-    trained on several data sets have "<data set>_buffer_..." for each: LeRobot took the first of them."""
+    """Statistics in the older layout, among the weights; groups with the same statistic must agree. A policy that was trained on several
+    data sets has "<data set>_buffer_..." per data set, of which LeRobot used the first."""
     marker = "buffer_" + feature.replace(".", "_") + "."
     robots: Dict[str, Dict[str, np.ndarray]] = {}
     for name, entry in sorted(checkpoint.old_statistics.items()):
@@ -156,6 +161,6 @@ def _robot(checkpoint: Checkpoint, robots: List[str], problems: Problems) -> str
         return checkpoint.robot if checkpoint.robot in robots else "".join(robots)
     names = ", ".join(name for name in robots if name) or "none, since the statistics are those of one robot"
     expected = "whose statistics to normalize with: " + names
-    if ("--stats", expected) not in [(problem.where, problem.expected) for problem in problems.list]:  # not again for actions
+    if ("--stats", expected) not in [(problem.where, problem.expected) for problem in problems.list]:  # reported once for state and action
         problems.add("--stats", expected, checkpoint.robot or "nothing", code=Code.USAGE)
     return ""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a person may say beyond a checkpoint. A layout declares the options that its checkpoints leave open; `vla-convert` collects them."""
+"""Options for facts that a checkpoint does not state. Each layout declares its options; `vla-convert` collects them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Callable, NamedTuple, Tuple
 
 
 class Option(NamedTuple):
-    """Not given means: as the checkpoint says. Layouts may share one, each with its own help."""
+    """A command-line option. If it is not given, the checkpoint decides. Layouts may share an option, each with its own help."""
 
     flag: str  # --max-views; the attribute of archs.Options is max_views
     help: str
@@ -22,7 +22,7 @@ class Option(NamedTuple):
         return self.flag[2:].replace("-", "_")
 
     def arguments(self) -> dict:
-        """As argparse takes it."""
+        """Keyword arguments of argparse's add_argument."""
         if self.default is False:
             return {"action": "store_true"}
         if self.choices:
@@ -33,8 +33,8 @@ class Option(NamedTuple):
 
 
 HUB = "hub:OWNER/NAME@REVISION"
-STORED = "stored"  # --dtype: every matrix as it is stored
-CODES = ("int8", "int4")  # --dtype: by `vla quantize`
+STORED = "stored"  # --dtype: every matrix keeps its stored type
+CODES = ("int8", "int4")  # --dtype: quantized by `vla quantize`
 COMMON = (
     Option(
         "--backbone",
@@ -101,5 +101,5 @@ def stats(what: str) -> Option:
 
 
 def views(what: str) -> Option:
-    """Names, with commas between them."""
+    """The option --views: names separated by commas. `what`: its help."""
     return Option("--views", what, "A,B,...", (), read=lambda text: text.split(","))

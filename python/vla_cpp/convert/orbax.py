@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays of an Orbax checkpoint, as JAX saves policies: a tree of Zarr arrays, by itself or inside an OCDBT database. TensorStore reads them.
+"""Reads arrays of an Orbax checkpoint, JAX's format: a tree of Zarr arrays, alone or inside an OCDBT database. Uses TensorStore.
 
 Reference: orbax checkpoint/_src/serialization (names of arrays), metadata/tree.py (`_METADATA`).
 """
@@ -24,7 +24,7 @@ MAX_ELEMENTS = 1 << 34
 
 
 class Stored(NamedTuple):
-    """An array of the checkpoint. `read` gives all of it, or what an index, a slice or a tuple of indices selects, as float32."""
+    """An array of the checkpoint. `read` returns float32: the whole array, or the part that an index, a slice or a tuple of indices selects."""
 
     shape: Tuple[int, ...]
     dtype: str
@@ -32,13 +32,13 @@ class Stored(NamedTuple):
 
 
 class Computed(NamedTuple):
-    """A tensor that is made of stored arrays. It has the members of an `Entry`, and gives float32."""
+    """A tensor that is computed from stored arrays. Has the members of an `Entry`; its chunks are float32."""
 
     name: str
     path: str
     shape: Tuple[int, ...]
-    stored: str  # the type that the policy has in the file
-    make: Callable[[int, int], np.ndarray]  # of so many rows from one on
+    stored: str  # the type of the policy's arrays in the file
+    make: Callable[[int, int], np.ndarray]  # (first row, number of rows) -> these rows
     by_rows: bool = False  # whether a few rows cost less than all
     first: int = 0
     dtype: str = "F32"
@@ -65,7 +65,7 @@ def is_orbax(folder: str) -> bool:
 
 
 def read_orbax(folder: str) -> Dict[str, Stored]:
-    """The arrays by their names, with slashes between the names of the levels. Errors: io, bad_bundle, unsupported."""
+    """The arrays by name; slashes separate the levels of the tree. Errors: io, bad_bundle, unsupported."""
     where = os.path.join(folder, METADATA)
     try:
         import tensorstore
@@ -91,7 +91,7 @@ def _open(tensorstore, folder: str, driver: str, name: str) -> Stored:
     store = {"driver": "ocdbt", "base": root, "path": name + "/"} if in_database else root + name + "/"
     try:
         array = tensorstore.open({"driver": driver, "kvstore": store}, read=True, open=True).result()
-    except Exception as error:  # noqa: BLE001 - of whatever kind that library raises
+    except Exception as error:  # noqa: BLE001 - TensorStore raises errors of several classes
         raise refuse(where, "an array", str(error)[:200], "the checkpoint is damaged or not complete: download or save it again", Code.IO)
     if array.dtype.name not in TYPES or math.prod(array.shape) > MAX_ELEMENTS:
         raise refuse(where, "floats, at most {}".format(MAX_ELEMENTS), "{} of {}".format(array.shape, array.dtype.name))

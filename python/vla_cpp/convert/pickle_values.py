@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Values of a pickle, without executing anything in it.
+"""Reads the values of a pickle without executing anything in it.
 
-A pickle is a program for a stack machine. Python's own machine imports and calls whatever the program names; this one builds
-lists, dictionaries and tuples, and turns every imported name and every call into an inert record. The few calls that mean data are
-made by the caller's `calls`. Its steps and bytes are limited, and no step takes more memory than its own bytes.
+A pickle is a program for a stack machine. Python's own machine imports and calls everything that the program names. This machine builds
+lists, dictionaries and tuples, and turns every imported name and every call into an inert record, except the few calls that stand for
+data, for which the caller provides `calls`. Its steps and bytes are limited, and no step takes more memory than its own bytes.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Callable, Dict, Iterator, List, NamedTuple, Tuple
 
 from .errors import refuse
 
-# The weights of a policy of a thousand tensors take some 100 KB and 50,000 steps; an optimizer's state a few times that.
+# The pickle of a policy with a thousand tensors has about 100 KB and 50,000 steps; with an optimizer's state a few times more.
 MAX_BYTES, MAX_STEPS = 16 << 20, 2_000_000
-# Opcodes that push their argument (protocols 2 to 5; the text opcodes of older ones are not spoken).
+# Opcodes that push their argument (protocols 2 to 5; the text opcodes of older protocols are not supported).
 ARGUMENTS = set(
     """
     BININT BININT1 BININT2 LONG1 LONG4 BINFLOAT BINUNICODE SHORT_BINUNICODE BINUNICODE8
@@ -35,25 +35,25 @@ OTHERS = set(
     """.split()
 )
 KNOWN = OTHERS.union(ARGUMENTS, CONSTANTS, EMPTY, TUPLES, PUTS, GETS)
-KEYS = (str, int, float, bytes, type(None))  # of dictionaries that are kept; entries with other keys are dropped
-MAX_KEY = 1 << 60  # whole numbers from 2^61 - 1 on share the hashes of smaller ones, and a dictionary of them takes quadratic time
+KEYS = (str, int, float, bytes, type(None))  # types of keys that are kept; entries with other keys are dropped
+MAX_KEY = 1 << 60  # integers from 2^61 - 1 on have the same hashes as smaller ones; a dictionary of such keys takes quadratic time
 
 
 class Global(NamedTuple):
-    """A name that the pickle asks to import, "module name"."""
+    """A name that the pickle imports, as "module name"."""
 
     name: str
 
 
 class Inert:
-    """What an import or a call would have made: only its name is known."""
+    """Stands for the result of an import or a call, of which only the name is known."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
 
 def describe(value) -> str:
-    """A value in a refusal: never its content, which may be nested without end."""
+    """A value's name or type for an error message, never its content, which may be nested endlessly."""
     return value.name.replace(" ", ".")[:100] if isinstance(value, (Global, Inert)) else type(value).__name__
 
 
@@ -61,7 +61,7 @@ def _is_key(value) -> bool:
     return isinstance(value, KEYS) and not (isinstance(value, int) and abs(value) >= MAX_KEY)
 
 
-Calls = Dict[str, Callable[[tuple], object]]  # "module name" -> what a call of it with these arguments makes
+Calls = Dict[str, Callable[[tuple], object]]  # "module name" -> function that returns the value of a call with these arguments
 MARK = object()
 
 
@@ -130,7 +130,7 @@ class _Machine:
                 stack.append({})
             self.update(items)
         elif name in ("ADDITEMS", "FROZENSET"):
-            self.since_mark()  # members of sets are dropped
+            self.since_mark()  # drops members of sets
             if name == "FROZENSET":
                 stack.append(Inert("frozenset"))
         elif name == "GLOBAL":
@@ -145,7 +145,7 @@ class _Machine:
             self.pop(dict), self.pop(tuple)
             stack.append(Inert(describe(self.pop())))
         elif name == "BUILD":
-            self.pop()  # attributes of an object
+            self.pop()  # drops attributes of an object
             self.top()
         elif name == "BINPERSID":
             stack.append(self.persistent(self.pop()))
@@ -172,7 +172,7 @@ class _Machine:
 
 
 def _steps(data: bytes) -> Iterator[Tuple[str, object]]:
-    """Names of opcodes with their arguments. An argument is read after its opcode is known to be one that this machine has."""
+    """Names of opcodes with their arguments. An argument is read only for an opcode that this machine supports."""
     file = io.BytesIO(data)
     for _ in range(MAX_STEPS):
         code = file.read(1)
@@ -184,7 +184,7 @@ def _steps(data: bytes) -> Iterator[Tuple[str, object]]:
 
 
 def read_pickle(data: bytes, where: str, calls: Calls, persistent: Callable[[object], object]):
-    """The value that the pickle describes. `persistent`: what a persistent id stands for. Errors: bad_bundle."""
+    """The value in the pickle. `persistent`: maps a persistent id to its value. Errors: bad_bundle."""
     machine = _Machine(calls, persistent)
     try:
         for name, argument in _steps(data):
@@ -193,13 +193,13 @@ def read_pickle(data: bytes, where: str, calls: Calls, persistent: Callable[[obj
             machine.step(name, argument)
         return machine.pop()
     except (ValueError, IndexError, KeyError) as error:
-        # Damaged arguments are ValueErrors of pickletools; an empty stack and an unknown memo are the other two.
+        # A damaged argument is a ValueError of pickletools; the other exceptions come from an empty stack or an unknown memo.
         reason = str(error) if isinstance(error, ValueError) else "a stack or a memo that lacks a value"
         raise refuse(where, "a well-formed pickle", reason[:200], "the file is truncated or damaged: download or save it again")
 
 
 def ordered_dict(arguments: tuple) -> dict:
-    """collections.OrderedDict, empty or of pairs."""
+    """The value of a call of collections.OrderedDict, without arguments or with pairs."""
     if not arguments:
         return {}
     pairs = arguments[0] if isinstance(arguments[0], list) else [()]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot's pre- and post-processors as recipe operations.
 
-Every step and every field is either translated or refused: a step that is skipped is a number that changes.
+Every step and every field is either translated or refused: skipping a step would change numbers.
 Reference: lerobot src/lerobot/processor (normalize_processor.py, tokenizer_processor.py, rename_processor.py, pipeline.py).
 """
 
@@ -21,11 +21,11 @@ from .files import member, plain_name
 from .normalization import MODES, Context, Found, Normalization, choose, from_file, from_weights
 
 STATE, ACTION = "observation.state", "action"
-MAX_TOKENS = 1 << 16  # far above any instruction
+MAX_TOKENS = 1 << 16  # tokens; far above any instruction
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
 
-# Fields of each step that this converter knows. A tuple of values: only these leave the numbers as the recipe has them.
-# An architecture adds the steps that are its own.
+# Fields of each step that this converter knows, with their permitted values: a tuple lists the values with which the recipe is exact.
+# An architecture adds its own steps.
 ANY = object()
 Steps = Dict[str, Dict[str, Dict[str, object]]]
 DEVICE = {"device": ANY, "float_dtype": (None, "float32", "float")}
@@ -49,7 +49,7 @@ STEPS: Steps = {
 }
 
 
-RELATIVE: Steps = {  # of policies that may have learned actions relative to the state
+RELATIVE: Steps = {  # steps of policies that may have learned actions relative to the state
     PRE: {"relative_actions_processor": {"enabled": (True, False), "exclude_joints": ANY, "action_names": ANY}},
     POST: {"absolute_actions_processor": {"enabled": (True, False)}},
 }
@@ -57,27 +57,27 @@ RELATIVE: Steps = {  # of policies that may have learned actions relative to the
 
 @dataclass
 class Processors:
-    """What the two pipelines say, free of their format."""
+    """The contents of the two pipelines, independent of their format."""
 
     rename: Dict[str, str] = field(default_factory=dict)  # accepted name -> the policy's name
     newline: bool = False
     discrete_state: bool = False  # the discretized state is part of the prompt
     relative: bool = False  # actions are relative to the state
-    add_state: Sequence[int] = ()  # in these columns
+    add_state: Sequence[int] = ()  # columns of relative actions
     max_tokens: int = 0
-    own_tokenizer: str = ""  # folder inside the checkpoint
+    own_tokenizer: str = ""  # folder of the tokenizer inside the checkpoint
     state: Normalization = field(default_factory=Normalization)
     action: Normalization = field(default_factory=Normalization)
-    others: Dict[str, Normalization] = field(default_factory=dict)  # of further features of the observation
+    others: Dict[str, Normalization] = field(default_factory=dict)  # by further feature of the observation
 
     def statistics(self, without: Sequence[str] = ()) -> Dict[str, np.ndarray]:
-        """By the name of the bundle's tensor. `without`: features whose statistics are no tensors there."""
+        """Statistics by the name of the bundle's tensor. `without`: features whose statistics the bundle does not store as tensors."""
         known = ((STATE, self.state), (ACTION, self.action), *self.others.items())
         return {"stats.{}.{}".format(f, name): v for f, norm in known if f not in without for name, v in norm.statistics.items()}
 
 
 class _Reader:
-    """Walks over both pipelines and collects what it cannot translate."""
+    """Reads both pipelines and collects everything that it cannot translate."""
 
     def __init__(
         self,
@@ -215,7 +215,7 @@ class _Reader:
         width = self.context.dims[STATE]
         listed = member(member(self.checkpoint.config, "input_features", dict, "config.json"), STATE, dict, "config.json: input_features")
         widths = ([width], [self.context.min_widths.get(STATE, width)], listed.get("shape"))
-        of_base = not features and step.get("state_file") is None  # a base policy as LeRobot publishes it: without statistics
+        of_base = not features and step.get("state_file") is None  # LeRobot publishes base policies without statistics
         if not of_base and (stated.get("shape") not in widths or stated.get("type") != "STATE"):
             self.problems.add("{}: features.{}".format(where, STATE), "STATE of [{}] as in config.json".format(width), str(stated)[:80])
         self.result.state = self.normalization(where, config, step, STATE, "STATE")
@@ -244,7 +244,7 @@ class _Reader:
         return choose(feature, modes.get(kind, "IDENTITY"), eps, found, self.context)
 
     def normalizes_pixels(self) -> bool:
-        """Or has none to normalize."""
+        """Whether this converter normalizes pixels by statistics, or the policy has no cameras."""
         features = member(self.checkpoint.config, "input_features", dict, "config.json").values()
         has_cameras = any(isinstance(feature, dict) and feature.get("type") == "VISUAL" for feature in features)
         return "VISUAL" in self.others.values() or not has_cameras
@@ -256,15 +256,15 @@ class _Reader:
 
 
 def relative_columns(width: int, names: Optional[Sequence[str]], exclude: Sequence[str]) -> List[int]:
-    """Columns whose name contains none of the excluded words; without names or words all of them
+    """Columns of relative actions: those whose name contains none of the excluded words; all columns without names or words
     (relative_action_processor.py, _build_mask)."""
     known = [name.lower() for name in (names or [])[:width]] if exclude else []
     return [i for i in range(width) if i >= len(known) or not any(word in known[i] for word in exclude)]
 
 
 def statistics_width(checkpoint: Checkpoint, feature: str, kind: str) -> int:
-    """Numbers of the statistics that the feature's mode reads; 0 where they are not all of one width, or there are none. What is amiss with
-    them is told where they are read."""
+    """Width of the statistics that the feature's mode reads; 0 if their widths differ or there are none. Reports no problems: reading the
+    statistics later does."""
     problems, modes = Problems(""), checkpoint.config.get("normalization_mapping")
     try:
         if checkpoint.processors is None:
@@ -290,10 +290,15 @@ def read_processors(
     others: Optional[Mapping[str, str]] = None,
     reads_text: bool = True,
 ) -> Processors:
-    """Both pipelines, or in the older layout what today's pipelines would be with the statistics from the weights. `own`: the
-    steps that this architecture has beside those of all policies. `min_widths`: for a policy that pads before it normalizes and whose
-    `dims` are the padded widths, those of the robot; such a policy also builds its prompt itself. `others`: features of the observation beside the state that the
-    policy normalizes, with their kind. `reads_text`: without it a checkpoint needs no tokenizer."""
+    """Reads both pipelines. For the older layout: the equivalent pipelines of the current layout, with the statistics from the weights.
+
+    dims        widths by feature
+    own         steps of this architecture, beside those of all policies
+    min_widths  for a policy that pads before it normalizes, whose `dims` are the padded widths: the robot's widths. Such a policy also
+                builds its prompt itself
+    others      features of the observation beside the state that the policy normalizes, with their kind
+    reads_text  False: the checkpoint needs no tokenizer
+    """
     reader = _Reader(checkpoint, dims, identity, problems, own, min_widths or {}, others or {})
     for feature in identity:
         if feature not in dims:
@@ -312,7 +317,7 @@ def read_processors(
 
 
 def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
-    """Reference: lerobot processor/migrate_policy_normalization.py, which builds today's pipelines for such checkpoints."""
+    """The pipelines for a checkpoint without processor files. Reference: lerobot processor/migrate_policy_normalization.py."""
     checkpoint.notes.append("no processor files: older layout, statistics from the weights, pipelines as LeRobot's migration makes them")
     config = checkpoint.config
     modes = member(config, "normalization_mapping", dict, "config.json")
@@ -331,12 +336,12 @@ def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
 
 
 def recipe_key(document: Dict[str, List[dict]]) -> Key:
-    """`document`: ops of image, text, state and action."""
+    """The recipe as a key. `document`: ops of image, text, state and action."""
     return Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False))
 
 
 def letterbox(width: int, height: int, align: str, antialias: bool = False) -> dict:
-    """Padded with black: for every policy, the reference pads with 0 before it scales."""
+    """A letterbox op, padded with black: for every policy, the reference pads with 0 before it scales values."""
     size = {"width": width, "height": height}
     return {"op": "letterbox", **size, "filter": "bilinear", "antialias": antialias, "align": align, "fill": 0.0}
 
@@ -347,7 +352,7 @@ def text_ops(processors: Processors, truncate: str) -> List[dict]:
 
 
 def view_aliases(views: Sequence[str], processors: Processors, notes: List[str], problems: Problems) -> List[str]:
-    """Per view the other name that the rename step accepts. A renaming that the bundle cannot express is refused."""
+    """For each view the other name that the rename step accepts, or "". Refuses a renaming that a bundle cannot express."""
     aliases = dict.fromkeys(views, "")
     for old, new in processors.rename.items():
         where = "{}: rename_map".format(PRE)

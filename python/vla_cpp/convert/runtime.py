@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What `vla` is asked for, where it is at hand: to open a bundle that was written, and to make codes of int8 or int4, so that one place decides
-what a code is. Converting floats needs no `vla`."""
+"""Runs the program `vla`: to open a written bundle as a check, if the program is found, and to quantize to int8 or int4, so that only the
+runtime defines the codes. Converting floats needs no `vla`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from typing import List, Sequence
 from ..program import candidates
 from .errors import Code, refuse
 
-NONE = "none"  # --vla: no program is asked
-REFUSALS = (Code.BAD_BUNDLE, Code.UNSUPPORTED)  # what else keeps `vla` from opening a bundle is the machine's matter
+NONE = "none"  # --vla: run no program
+REFUSALS = (Code.BAD_BUNDLE, Code.UNSUPPORTED)  # exit codes that blame the bundle; others have causes in this machine
 
 
 def program(given: str, does: str = "makes codes") -> str:
-    """The path of `vla`, as given or found. Raises ConvertError where there is none."""
+    """The path of `vla`: the given one, else that of VLA_BINARY, else the usual places. Raises ConvertError if there is none."""
     named = given or os.environ.get("VLA_BINARY")
     places = [Path(named)] if named else candidates()
     for path in places:
@@ -30,7 +30,7 @@ def program(given: str, does: str = "makes codes") -> str:
 
 
 def find(given: str) -> str:
-    """The path of `vla`: as given, beside this package, or on PATH; empty where there is none, or none is wanted."""
+    """The path of `vla`: the given one, else that of VLA_BINARY, of this package, or on PATH; empty if there is none, or `given` is "none"."""
     if given == NONE:
         return ""
     if given or os.environ.get("VLA_BINARY"):
@@ -39,8 +39,8 @@ def find(given: str) -> str:
 
 
 def check(vla: str, bundle: str, name: str, robots: Sequence[str]) -> str:
-    """Asks `vla` to open a bundle, for each of its robots if it has several. `name`: of the bundle in what it says. Returns why it could not
-    say. Raises ConvertError with what it refuses."""
+    """Opens a bundle with `vla`, once per robot if there are several. `name`: the bundle's name in messages. Returns why `vla` could not run
+    the check, or "". Raises ConvertError if `vla` refuses the bundle."""
     for robot in robots or [""]:
         try:
             done = _run([vla, "inspect", bundle, *(["--embodiment", robot] if robot else [])])
@@ -57,7 +57,7 @@ def check(vla: str, bundle: str, name: str, robots: Sequence[str]) -> str:
 
 
 def quantize(vla: str, bundle: str, out: str, dtype: str, force: bool) -> None:
-    """Writes `out`, of a bundle of floats. Raises ConvertError with what `vla quantize` says."""
+    """Quantizes a bundle of floats into `out`. Raises ConvertError with the message of `vla quantize`."""
     done = _run([vla, "quantize", bundle, "-o", out, "--dtype", dtype, "--quiet", *(["--force"] if force else [])])
     if done.returncode:
         code = Code(done.returncode) if done.returncode in list(map(int, Code)) else Code.INTERNAL
@@ -69,6 +69,6 @@ def _run(command: List[str]) -> subprocess.CompletedProcess:
 
 
 def _said(done: subprocess.CompletedProcess, bundle: str, name: str) -> str:
-    """In one line."""
+    """The program's error message in one line, with `name` instead of the path `bundle`."""
     lines = [line.strip() for line in done.stderr.replace(bundle, name).splitlines() if line.strip()]
     return "; ".join(lines).partition("error: ")[2] or "; ".join(lines) or "exit code {}".format(done.returncode)

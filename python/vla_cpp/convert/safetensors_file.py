@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bounded reader of safetensors files (format: 8 bytes header length, JSON header, data).
 
-A checkpoint comes from somewhere else, so every length and offset is compared with the size of the file before it is used.
-Data is read in chunks, never mapped as a whole: a conversion needs a few megabytes whatever the size of the checkpoint.
+A checkpoint is untrusted, so every length and offset is compared with the size of the file before it is used.
+Data is read in chunks, never mapped as a whole: a conversion needs a few megabytes for a checkpoint of any size.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from .dtypes import SIZES, STATISTICS
 from .errors import refuse
 from .files import open_file
 
-# The limit that the format's own library sets; a header of a large checkpoint takes less than a megabyte.
+# The limit of the format's own library, in bytes; the header of a large checkpoint has less than a megabyte.
 MAX_HEADER = 100_000_000
 CHUNK_BYTES = 8 << 20
-MAX_TENSORS = 50_000  # of a file; the largest policies have some thousand
+MAX_TENSORS = 50_000  # tensors in a file; the largest policies have a few thousand
 
 
 class Entry(NamedTuple):
-    """One tensor of a file: shape as torch has it, position in bytes from the start of the file."""
+    """One tensor of a file: shape in torch's order of dimensions, offset in bytes from the start of the file."""
 
     name: str
     dtype: str
@@ -36,12 +36,12 @@ class Entry(NamedTuple):
     n_bytes: int
 
     def rows(self, first: int, count: int) -> "Entry":
-        """A run of rows, for a tensor that stacks several: `first` and `count` lie within its first dimension."""
+        """The rows from `first` to `first + count`, which must lie within the first dimension; for a tensor that stacks several."""
         row = self.n_bytes // self.shape[0]
         return self._replace(shape=(count, *self.shape[1:]), offset=self.offset + first * row, n_bytes=count * row)
 
     def chunks(self, chunk_bytes: int = CHUNK_BYTES) -> Iterator[np.ndarray]:
-        """The tensor's elements in order, as flat arrays of bounded size (BF16 as uint16 bits)."""
+        """The tensor's elements in order, as flat arrays of at most `chunk_bytes` (BF16 as uint16 bits)."""
         kind = STATISTICS[self.dtype]
         left = self.n_bytes // kind.itemsize
         with open_file(self.path) as file:
@@ -60,7 +60,7 @@ class SafetensorsFile(NamedTuple):
 
 
 def check_count(where: str, n_tensor: int) -> None:
-    """Before anything is made for each of them. Errors: bad_bundle."""
+    """Refuses too many tensors, before any memory is used for each. Errors: bad_bundle."""
     if n_tensor > MAX_TENSORS:
         raise refuse(where, "at most {} tensors".format(MAX_TENSORS), str(n_tensor))
 
@@ -109,7 +109,7 @@ def _read_entry(path: str, name: str, value, start: int, size: int) -> Entry:
 
 
 def _check_layout(path: str, entries: Dict[str, Entry], start: int, size: int) -> None:
-    """The format leaves no gaps and no overlaps: a file in which two names share bytes is not what a trainer saved."""
+    """Checks that the data has no gaps and no overlaps, as the format requires."""
     position = start
     for entry in sorted(entries.values(), key=lambda e: (e.offset, e.n_bytes)):
         if entry.offset != position:
@@ -120,7 +120,7 @@ def _check_layout(path: str, entries: Dict[str, Entry], start: int, size: int) -
 
 
 def read_safetensors(path: str) -> SafetensorsFile:
-    """Parses and checks the header; no tensor data is read."""
+    """Reads and checks the header, without tensor data."""
     header, start, size = _read_header(path)
     metadata = header.pop("__metadata__", {})
     if not isinstance(metadata, dict) or not all(isinstance(v, str) for v in metadata.values()):

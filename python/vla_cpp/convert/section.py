@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A JSON object of a config, read by type and range; what does not fit is collected and a harmless stand-in returned."""
+"""Reads a JSON object of a config with checks of type and range. Invalid values are collected as problems, and a harmless value is returned."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Collection, Dict, Tuple
 
 from .errors import Problems
 
-# Far above any policy: a hostile config must not make the converter plan without end.
+# Far above any policy's sizes: a malicious config must not make the converter plan endlessly.
 MAX_SIZE = 1 << 24
 ANY_INT = -1 << 31
-Fixed = Dict[str, Tuple[object, object]]  # key -> the class's default, the value that the runtime implements
+Fixed = Dict[str, Tuple[object, object]]  # key -> (default of the reference's class, the only value that the runtime supports)
 
 
 class Section:
-    """`defaults` are those of the reference's own class. `nullable`: keys whose null means the default, as it does there."""
+    """An object of a config. `defaults`: those of the reference's own class. `nullable`: keys for which the class treats null as the default."""
 
     def __init__(self, where: str, values: dict, defaults: Dict[str, object], problems: Problems, nullable=()):
         self.where, self.values, self.defaults, self.problems = where, values, dict(defaults), problems
@@ -49,7 +49,7 @@ class Section:
             self.bad(key, repr(value), hint=hint, unsupported=True)
 
     def check_fixed(self, fixed: Fixed, hint: str = "") -> None:
-        """Refuses what the runtime does not implement, by the class's default where a key is absent."""
+        """Refuses values that the runtime does not support; an absent key has the default of the class."""
         for key, (default, value) in fixed.items():
             self.defaults[key] = default
             if self.get(key) != value:

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""tokenizer.json, or the older files that replace it, as the keys of a bundle, after checking that the runtime implements this tokenizer.
+"""Converts tokenizer.json, or the older files in its place, to the keys of a bundle, after checking that the runtime implements the tokenizer.
 
-Three kinds are known, each with a module of its own: byte-level BPE, BPE with byte fallback and WordPiece. What they share stands
-in tokenizer_parts.py.
+Three kinds are supported, each with its own module: byte-level BPE, BPE with byte fallback, and WordPiece. tokenizer_parts.py has their
+common parts.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .tokenizer_parts import (
 )
 
 MODEL_FILE = "config.json"
-# The tokenizer's class by model_type, of the models whose tokenizers are used here (transformers 5.5).
+# transformers 5.5: the tokenizer's class by model_type, for the models whose tokenizers this converter supports.
 CLASSES = {
     "bart": "RobertaTokenizer",
     "bert": "BertTokenizer",
@@ -39,22 +39,23 @@ CLASSES = {
     **dict.fromkeys(("internvl_chat", "llava", "openvla"), GENERIC[0]),
     **dict.fromkeys(("internvl", "qwen2", "qwen2_5_vl", "qwen2_vl", "qwen3", "qwen3_vl"), "Qwen2Tokenizer"),
 }
-NO_ROW = -1  # the id of an added token that the embedding has no row for
+NO_ROW = -1  # id of an added token without a row in the embedding
 
 
 class TokenizerPlan(NamedTuple):
     keys: List[Key]  # the bundle's `tokenizer.*`
-    truncate: str  # the side on which a text that is too long loses tokens: left or right
-    n_own: int  # tokens of the model itself, without added ones: transformers' vocab_size
+    truncate: str  # the side on which a too long text loses tokens: left or right
+    n_own: int  # number of the model's own tokens, without added ones: transformers' vocab_size
 
     @property
     def tokens(self) -> List[str]:
-        """Their texts, by id."""
+        """Texts of the tokens, by id."""
         return next(key.value for key in self.keys if key.name == "tokenizer.tokens")
 
 
 def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[str], more: Sequence[str] = ()) -> TokenizerPlan:
-    """`n_vocab`: rows of the embedding table, which no id may reach. `more`: special tokens that the reference's own code adds."""
+    """Reads the tokenizer in a folder. `n_vocab`: rows of the embedding table; ids must be smaller. `more`: special tokens that the
+    reference's own code adds."""
     spec, config = _read_files(folder, problems, notes)
     model = member(spec, "model", dict, JSON_FILE)
     kind = _kind(model)
@@ -83,7 +84,7 @@ def _kind(model: dict):
 
 
 def _read_files(folder: str, problems: Problems, notes: List[str]) -> Tuple[dict, dict]:
-    """tokenizer.json, or what it would say where there are older files alone, and tokenizer_config.json."""
+    """tokenizer.json, or its equivalent from older files; and tokenizer_config.json."""
     path, config_path = os.path.join(folder, JSON_FILE), os.path.join(folder, CONFIG_FILE)
     pieces = tokenizer_sentencepiece.find(folder)
     config = read_json(config_path) if os.path.exists(config_path) else {}
@@ -105,8 +106,9 @@ def _read_files(folder: str, problems: Problems, notes: List[str]) -> Tuple[dict
 
 
 def _with_class(folder: str, config: dict) -> dict:
-    """The config with the class that AutoTokenizer builds: where the folder has the config of a model, the one of its model_type. A class
-    of another name than that yields to the file as it is (transformers auto/tokenization_auto.py, from_pretrained)."""
+    """The config with the class that AutoTokenizer builds. If the folder has a model's config, this is the class of its model_type; if
+    tokenizer_config.json names another class, the generic class reads the file unchanged (transformers auto/tokenization_auto.py,
+    from_pretrained)."""
     path = os.path.join(folder, MODEL_FILE)
     stated = read_json(path) if os.path.isfile(path) else {}
     own = CLASSES.get(str(stated.get("model_type")))
@@ -119,13 +121,14 @@ def _with_class(folder: str, config: dict) -> dict:
 
 
 def _with_rows(added: List[dict], n_vocab: int) -> List[dict]:
-    """PaliGemma's <image> has no row in the embedding: the reference fails on text with it, the runtime refuses it."""
+    """Added tokens with the id NO_ROW if the embedding has no row for them, like PaliGemma's <image>. The reference fails on text with such a
+    token; the runtime refuses it."""
     return [dict(token, id=token["id"] if token["id"] < n_vocab else NO_ROW) for token in added]
 
 
 def _truncation_side(spec: dict, config: dict, problems: Problems) -> str:
-    """LeRobot's tokenizer step does not state a side, so the tokenizer's own holds: that of its config, else that of its file
-    (transformers tokenization_utils_tokenizers.py). The published SmolVLM2 tokenizer says left."""
+    """The side of truncation in the tokenizer's config, else in its file (transformers tokenization_utils_tokenizers.py); LeRobot's
+    tokenizer step states none. The published SmolVLM2 tokenizer truncates on the left."""
     stated = member(spec, "truncation", dict, JSON_FILE).get("direction")
     side = config.get("truncation_side", "right" if stated is None else str(stated).lower())
     if side not in ("left", "right"):

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""BPE with byte fallback: what Gemma, PaliGemma and Llama 2 publish.
+"""BPE with byte fallback: the tokenizers of Gemma, PaliGemma and Llama 2.
 
-Text is normalized by one rule, blanks to U+2581, and is not split at all: the pre-tokenizer of Gemma's file splits at blanks,
-of which none are left. transformers' GemmaTokenizer builds the same around vocabulary and merges. Llama 2's file puts a U+2581 in front
-of every text between added tokens, too.
+One rule normalizes text: blanks become U+2581. Text is not split: the pre-tokenizer in Gemma's file splits at blanks, but none are left.
+transformers' GemmaTokenizer builds the same from vocabulary and merges. Llama 2's file also adds a U+2581 before every text between added
+tokens.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BLANK_FIRST = [{"type": "Prepend", "prepend": "\u2581"}, *NORMALIZER]
 
 
 def with_defaults(config: dict) -> dict:
-    """The class's own defaults, which it adds to the vocabulary like stated ones."""
+    """The config with the default special tokens of its class, which the class adds to the vocabulary like stated ones."""
     return dict(GEMMA_TOKENS, **config) if config.get("tokenizer_class") in GEMMA else config
 
 
@@ -59,12 +59,14 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
 
 
 def _needed_bytes(vocab: dict) -> List[str]:
-    """A character that is a token never falls back to its byte: in Gemma's file the tab stands where <0x09> would be."""
+    """The byte tokens that the vocabulary must have. A character that is itself a token needs none: in Gemma's file the tab has the place
+    of <0x09>."""
     return [symbol for byte, symbol in enumerate(BYTES) if byte > 0x7F or chr(byte) not in vocab]
 
 
 def _check_characters(tokenizer: Tokenizer, problems: Problems) -> None:
-    """A bundle does not say whether an added token is also a symbol of the model, so a single character must be both."""
+    """Refuses an added token of one character that is not in the model's vocabulary: a bundle does not state whether an added token is also
+    a symbol of the model, so a single character must be both."""
     vocab = member(tokenizer.model, "vocab", dict, JSON_FILE)
     for token in tokenizer.added:
         if len(token["content"]) == 1 and token["content"] not in vocab:

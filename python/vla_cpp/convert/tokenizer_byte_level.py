@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Byte-level BPE: what SmolLM2, Qwen2, BART and the other descendants of GPT-2 publish.
+"""Byte-level BPE: the tokenizers of SmolLM2, Qwen2, BART and other descendants of GPT-2.
 
-Which pre-tokenizer and normalizer count follows the class that transformers 5.4 to 5.5 builds for `tokenizer_class`: the generic
-classes keep tokenizer.json as it is, GPT2Tokenizer, Qwen2Tokenizer and BartTokenizer take vocabulary and merges from it and bring
-their own.
+The class that transformers 5.4 to 5.5 builds for `tokenizer_class` determines pre-tokenizer and normalizer: generic classes use those in
+tokenizer.json; GPT2Tokenizer, Qwen2Tokenizer and BartTokenizer read only vocabulary and merges from the file and have their own.
 """
 
 from __future__ import annotations
@@ -32,14 +31,14 @@ from .tokenizer_parts import (
 KIND = "byte_level_bpe"
 GPT2 = ("GPT2Tokenizer", "GPT2TokenizerFast")
 QWEN2 = ("Qwen2Tokenizer", "Qwen2TokenizerFast")
-BART = ("BartTokenizer", "BartTokenizerFast", "RobertaTokenizer", "RobertaTokenizerFast")  # one class under several names
-# The splitting expressions of Qwen2 and Llama 3, as src/processor/pretokenizer.h has them.
+BART = ("BartTokenizer", "BartTokenizerFast", "RobertaTokenizer", "RobertaTokenizerFast")  # one class with several names
+# The splitting expressions of Qwen2 and Llama 3, the same as in src/processor/pretokenizer.h.
 QWEN2_WORDS = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
 LLAMA3_WORDS = QWEN2_WORDS.replace(r"|\p{N}|", r"|\p{N}{1,3}|")
 SPLITS = {
     words: {"type": "Split", "pattern": {"Regex": words}, "behavior": "Isolated", "invert": False} for words in (QWEN2_WORDS, LLAMA3_WORDS)
 }
-# What a class names where its config is silent.
+# Default special tokens of the classes.
 DEFAULTS = {
     **dict.fromkeys(GPT2, dict.fromkeys(("unk_token", "bos_token", "eos_token"), "<|endoftext|>")),
     **dict.fromkeys(QWEN2, dict.fromkeys(("unk_token", "eos_token", "pad_token"), "<|endoftext|>")),
@@ -62,14 +61,14 @@ MODEL = {
 
 
 def byte_symbols() -> List[str]:
-    """The 256 printable characters that stand for bytes in byte-level vocabularies (as GPT-2 defined them)."""
+    """The 256 printable characters that represent bytes in byte-level vocabularies (defined by GPT-2)."""
     kept = [*range(ord("!"), ord("~") + 1), *range(0xA1, 0xAC + 1), *range(0xAE, 0xFF + 1)]
     moved = {byte: 256 + i for i, byte in enumerate(b for b in range(256) if b not in kept)}
     return [chr(moved.get(byte, byte)) for byte in range(256)]
 
 
 def with_defaults(config: dict) -> dict:
-    """The class's own defaults, which it adds to the vocabulary like stated ones."""
+    """The config with the default special tokens of its class, which the class adds to the vocabulary like stated ones."""
     return dict(DEFAULTS.get(str(config.get("tokenizer_class")), {}), **config)
 
 
@@ -104,7 +103,7 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
 
 
 def _around(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> Tuple[List[int], List[int]]:
-    """BART's class makes the template itself."""
+    """The ids before and after every text. BART's class builds this template itself."""
     config, post = tokenizer.config, tokenizer.spec.get("post_processor")
     is_bart = isinstance(post, dict) and post.get("type") == "RobertaProcessing" and config.get("tokenizer_class") not in GPT2 + QWEN2
     if not is_bart and config.get("tokenizer_class") not in BART:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a tokenizer.json that both kinds of tokenizers share: vocabulary, merges, added tokens, and the checks of them."""
+"""Parts of a tokenizer.json that all kinds of tokenizers share: vocabulary, merges, added tokens, and their checks."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ NAMED = (
 
 
 class Tokenizer(NamedTuple):
-    """What the files say, before any of it is judged."""
+    """The contents of the tokenizer's files, before any check."""
 
     spec: dict  # tokenizer.json
     config: dict  # tokenizer_config.json with the defaults of its class
-    model: dict  # the member of spec
-    added: List[dict]  # the bundle's form of added tokens
+    model: dict  # the member `model` of spec
+    added: List[dict]  # added tokens in the form that a bundle stores
     n_vocab: int
 
 
@@ -62,7 +62,7 @@ def check_class(config: dict, names: Tuple[str, ...], problems: Problems) -> Non
 
 
 def one_or_sequence(value, member_name: str) -> list:
-    """The steps of a normalizer or pre-tokenizer, which may stand alone."""
+    """The steps of a normalizer or pre-tokenizer as a list; a single step may be stored without a Sequence."""
     if isinstance(value, dict) and value.get("type") == "Sequence":
         return member(value, member_name, list, JSON_FILE)
     return [] if value is None else [value]
@@ -73,8 +73,9 @@ def to_json(value) -> str:
 
 
 def added_tokens(spec: dict, model: dict, config: dict, problems: Problems, notes: List[str]) -> List[dict]:
-    """With the ids that the library gives them, whatever the file says: a token of the model's keeps its own, another gets the next one
-    (tokenizers added_vocabulary.rs, add_tokens). A class that builds its own tokenizer adds them in the order of the file's ids."""
+    """The added tokens, with the ids that the tokenizers library assigns, which may differ from the file's: a token of the model keeps the
+    model's id, any other gets the next free one (tokenizers added_vocabulary.rs, add_tokens). A class that builds its own tokenizer adds
+    them in the order of the file's ids."""
     vocab, added, renumbered = member(model, "vocab", dict, JSON_FILE), [], []
     listed = member(spec, "added_tokens", list, JSON_FILE)
     if config.get("tokenizer_class") not in (None, *GENERIC):
@@ -106,7 +107,7 @@ def next_id(added: List[dict], vocab: dict) -> int:
 
 
 def add_special(added: List[dict], model: dict, texts: Sequence[str], problems: Problems) -> None:
-    """As transformers adds special tokens: one that is there stays as it is, another gets the next id (tokenizers
+    """Adds special tokens to `added` as transformers does: an existing one stays unchanged, a new one gets the next id (tokenizers
     added_vocabulary.rs, add_tokens)."""
     vocab = member(model, "vocab", dict, JSON_FILE) if texts else {}
     there = {token["content"] for token in added}
@@ -122,7 +123,8 @@ def content_of(token) -> Optional[str]:
 
 
 def check_config_tokens(config: dict, added: List[dict], problems: Problems) -> None:
-    """transformers adds every token that the config names and tokenizer.json lacks: text would then split differently."""
+    """Checks that tokenizer.json has every token that the config names: transformers would add a missing one, and text would split
+    differently."""
     by_content = {token["content"]: token for token in added}
     for key in NAMED:
         value = config.get(key)
@@ -161,7 +163,7 @@ def check_config_tokens(config: dict, added: List[dict], problems: Problems) -> 
 
 
 def vocabulary(tokenizer: Tokenizer, problems: Problems) -> List[str]:
-    """Token texts by id."""
+    """Texts of the tokens, by id."""
     vocab = tokenizer.model.get("vocab")
     if (
         not isinstance(vocab, dict)
@@ -175,13 +177,13 @@ def vocabulary(tokenizer: Tokenizer, problems: Problems) -> List[str]:
             problems.add("{}: id {}".format(JSON_FILE, number), "one token", "{!r} and {!r}".format(by_id[number], text))
     check_ids(vocab, tokenizer.n_vocab, problems)
     _check_utf8(by_id.values(), problems)
-    # A hole gets a text that no merge and no word can produce: symbols contain no blank.
+    # An id without a token gets a text that no merge and no word can produce, since symbols contain no blank.
     last = max((number for number in by_id if number < tokenizer.n_vocab), default=-1)
     return [by_id.get(number, "<no token {}>".format(number)) for number in range(last + 1)]
 
 
 def check_symbols(model: dict, symbols: List[str], problems: Problems) -> None:
-    """With a symbol for each of the 256 bytes in the vocabulary no text can reach the unknown token."""
+    """Checks that the vocabulary has a symbol for each of the 256 bytes, so that no text needs the unknown token."""
     vocab = member(model, "vocab", dict, JSON_FILE)
     missing = [symbol for symbol in symbols if symbol not in vocab]
     if missing:
@@ -208,7 +210,7 @@ def _check_utf8(texts: Iterable[str], problems: Problems) -> None:
 
 
 def merges_of(merges, vocab: Dict[str, int], problems: Problems) -> List[str]:
-    """Merges in rank order as "left right", from either spelling of the file."""
+    """Merges in rank order as "left right"; the file may store each as one text or as a pair."""
     result = []
     for rank, merge in enumerate(merges if isinstance(merges, list) else []):
         pair = merge.split(" ") if isinstance(merge, str) else merge
@@ -225,13 +227,13 @@ def merges_of(merges, vocab: Dict[str, int], problems: Problems) -> List[str]:
 
 
 def prefix_ids(tokenizer: Tokenizer, problems: Problems) -> List[int]:
-    """The ids in front of every text, behind which none stand."""
+    """The ids before every text, for a template without ids after the text."""
     return stated_around(tokenizer, problems, "a template of special tokens and then the text", may_follow=False)[0]
 
 
 def stated_around(tokenizer: Tokenizer, problems: Problems, wanted: str, may_follow: bool) -> Tuple[List[int], List[int]]:
-    """The ids around every text: those of the file's template. transformers 5.5 reads add_bos_token and add_eos_token of the
-    config and then keeps the template all the same; a config that contradicts it may mean another release."""
+    """The ids before and after every text, from the file's template. transformers 5.5 keeps this template regardless of add_bos_token and
+    add_eos_token in the config; a config that contradicts the template is refused, since it may be meant for another release."""
     config = tokenizer.config
     front, behind = around_ids(tokenizer, problems, wanted, may_follow)
     if config.get("add_eos_token", False) not in (False, None):
@@ -247,8 +249,8 @@ def stated_around(tokenizer: Tokenizer, problems: Problems, wanted: str, may_fol
 
 
 def class_around(tokenizer: Tokenizer, stated: Tuple[List[int], List[int]], problems: Problems, notes: List[str]) -> Tuple[List[int], List[int]]:
-    """The ids around a text by a class that makes the template itself, of two tokens of the config. `stated`: what the file's template has,
-    which must be the same."""
+    """The ids before and after a text, for a class that builds the template itself from cls_token and sep_token of the config. `stated`: the
+    ids in the file's template, which must be the same."""
     ids = {**member(tokenizer.model, "vocab", dict, JSON_FILE), **{token["content"]: token["id"] for token in tokenizer.added}}
     names = [content_of(tokenizer.config.get(name)) for name in ("cls_token", "sep_token")]
     own = tuple([ids.get(name, -1)] for name in names if isinstance(name, str))
@@ -264,7 +266,7 @@ def class_around(tokenizer: Tokenizer, stated: Tuple[List[int], List[int]], prob
 
 
 def around_ids(tokenizer: Tokenizer, problems: Problems, wanted: str, may_follow: bool) -> Tuple[List[int], List[int]]:
-    """The ids in front of every text and behind it, as the file's template has them; `wanted` says what it may have."""
+    """The ids before and after every text in the file's template. `wanted`: describes the supported templates in an error."""
     # ByteLevel only trims offsets.
     posts = [post for post in one_or_sequence(tokenizer.spec.get("post_processor"), "processors") if not _is_byte_level(post)]
     if not posts:
@@ -283,7 +285,8 @@ def around_ids(tokenizer: Tokenizer, problems: Problems, wanted: str, may_follow
 
 
 def _template(post):
-    """RoBERTa's own step, which BART's files have, as the template that it is: cls, text, sep. Its other fields trim offsets."""
+    """RoBERTa's post-processing step, which BART's files have, as the equivalent template: cls, text, sep. Its other fields only trim
+    offsets."""
     if not isinstance(post, dict) or post.get("type") != "RobertaProcessing":
         return post
     known = {"type", "sep", "cls", "trim_offsets", "add_prefix_space"}

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A SentencePiece model, which is what openpi loads, as the tokenizer.json that transformers makes of the same file.
+"""Converts a SentencePiece model, which openpi loads, to the equivalent tokenizer.json, as transformers does.
 
-Reference: transformers convert_slow_tokenizer.py (GemmaConverter, GemmaSentencePieceExtractor, generate_merges). Both cut text alike,
-but for one thing: SentencePiece reads the name of a control token inside a text, such as <bos>, as plain characters.
+Reference: transformers convert_slow_tokenizer.py (GemmaConverter, GemmaSentencePieceExtractor, generate_merges). Both tokenize text alike
+except for the name of a control token, such as <bos>, within a text: SentencePiece reads it as plain characters.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Dict, List, Optional, Tuple
 from .errors import Code, Problems, refuse
 from .files import read_file
 
-FILES = ("tokenizer.model", "paligemma_tokenizer.model")  # the hub's name, and that of openpi's download
-CONFIG = {"tokenizer_class": "GemmaTokenizer"}  # where no tokenizer_config.json stands beside it
+FILES = ("tokenizer.model", "paligemma_tokenizer.model")  # file names on the hub and in openpi's download
+CONFIG = {"tokenizer_class": "GemmaTokenizer"}  # used if there is no tokenizer_config.json
 BLANK = "\u2581"
 BPE, NORMAL, UNKNOWN, CONTROL, USER_DEFINED, BYTE = 2, 1, 2, 3, 4, 6  # sentencepiece_model.proto
 MAX_SIZE = 64 << 20
@@ -28,14 +28,14 @@ def find(folder: str) -> Optional[str]:
 
 
 def read_spec(path: str, problems: Problems) -> dict:
-    """What a tokenizer.json would say. Errors: io, bad_bundle for another file, problems for settings that the runtime lacks."""
+    """The equivalent tokenizer.json. Errors: io; bad_bundle for a file of another format; problems for settings that the runtime lacks."""
     model = _parse(path)
     name = os.path.basename(path)
     _check_settings(model, name, problems)
     vocab = {piece.piece: i for i, piece in enumerate(model.pieces)}
     if len(vocab) != len(model.pieces):
         raise refuse(name, "pieces that differ", "{} of {} texts".format(len(vocab), len(model.pieces)))
-    if "\t" not in vocab and "<0x09>" in vocab:  # the converters do so; the tab keeps its id, and can be merged
+    if "\t" not in vocab and "<0x09>" in vocab:  # as in the reference's converter: the tab takes the id of <0x09> and can be merged
         vocab = {"\t" if text == "<0x09>" else text: i for text, i in vocab.items()}
     flags = {"single_word": False, "lstrip": False, "rstrip": False, "normalized": False}
     added = [
@@ -74,7 +74,7 @@ def _parse(path: str):
     model = sentencepiece_model_pb2.ModelProto()
     try:
         model.ParseFromString(read_file(path, MAX_SIZE))
-        # protobuf gives text that is not UTF-8 as bytes or as an error, according to its release
+        # For text that is not UTF-8, some protobuf releases return bytes and others raise an error.
         sound = all(isinstance(p.piece, str) and p.piece and math.isfinite(p.score) for p in model.pieces)
     except (DecodeError, UnicodeDecodeError) as error:
         raise refuse(path, "a SentencePiece model", str(error)[:80], "the file is damaged: download it again")
@@ -84,7 +84,7 @@ def _parse(path: str):
 
 
 def _check_settings(model, name: str, problems: Problems) -> None:
-    """Those of Gemma. With others a text is cut or normalized in ways that the runtime does not follow."""
+    """Refuses settings other than Gemma's, with which text is tokenized or normalized in ways that the runtime does not implement."""
     trainer, normalizer = model.trainer_spec, model.normalizer_spec
     found = {
         "trainer_spec.model_type": (trainer.model_type, BPE),
@@ -104,7 +104,8 @@ def _check_settings(model, name: str, problems: Problems) -> None:
 
 
 def _merges(model, vocab: Dict[str, int]) -> List[List[str]]:
-    """Every way to make a piece of two others: the best score first, of those the longest left part, then right part."""
+    """Every pair of pieces that forms a piece: by the formed piece's score, best first, then the longest left part, then the longest right
+    part."""
     merges: List[Tuple[float, int, int, str, str]] = []
     for piece in model.pieces:
         if piece.type not in (NORMAL, USER_DEFINED):

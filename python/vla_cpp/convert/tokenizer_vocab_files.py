@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """vocab.json and merges.txt of Qwen2, which older repositories have instead of tokenizer.json.
 
-Reference: transformers models/qwen2/tokenization_qwen2.py, whose class says how text is split.
+Reference: transformers models/qwen2/tokenization_qwen2.py, whose class defines how text is split.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def present(folder: str) -> bool:
 
 
 def read_spec(folder: str, config: dict, problems: Problems) -> dict:
-    """What a tokenizer.json would say. Errors: io, bad_bundle; problems for another class and for tokens without flags."""
+    """The equivalent tokenizer.json. Errors: io, bad_bundle; problems for another class and for tokens without flags."""
     name = config.get("tokenizer_class")
     if name not in QWEN2:
         problems.unsupported(
@@ -45,7 +45,7 @@ def read_spec(folder: str, config: dict, problems: Problems) -> dict:
 
 
 def _added_tokens(folder: str, config: dict, problems: Problems) -> List[dict]:
-    """The config states the flags of every added token; added_tokens.json has the ids alone, and must agree."""
+    """The added tokens with their flags from the config. added_tokens.json has only ids, which must agree."""
     decoder = member(config, "added_tokens_decoder", dict, CONFIG_FILE)
     added = [
         {"id": int(number), **token}

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""WordPiece: what BERT publishes, for text without capitals and accents.
+"""WordPiece: BERT's tokenizer, for text without capitals and accents.
 
-transformers' BertTokenizer builds normalization, splitting and template itself, around the vocabulary of the file alone, from the
-settings of tokenizer_config.json: both must say the same.
+transformers' BertTokenizer reads only the vocabulary from tokenizer.json, and builds normalization, splitting and template from the settings
+in tokenizer_config.json. The two files must agree.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ TOKENS = {name + "_token": "[{}]".format(name.upper()) for name in ("unk", "sep"
 
 
 def untyped(model: dict) -> str:
-    """The type of a model as files of older releases have it, which state none: they are told by what a model has."""
+    """The type of a model without a stated type, as in files of older releases: "WordPiece" if the model has its fields, else ""."""
     return "WordPiece" if "max_input_chars_per_word" in model and "continuing_subword_prefix" in model else ""
 
 
 def with_defaults(config: dict) -> dict:
-    """The class's own defaults, which it adds to the vocabulary like stated ones."""
+    """The config with the default special tokens of its class, which the class adds to the vocabulary like stated ones."""
     return dict(TOKENS, **config) if config.get("tokenizer_class") in BERT else config
 
 
@@ -71,7 +71,7 @@ def _check_settings(step, name: str, kind: str, problems: Problems) -> None:
 
 
 def _check_words(tokenizer: Tokenizer, problems: Problems) -> None:
-    """A bundle does not say whether an added token is also a word of the model, so it must be none that text can hold."""
+    """Refuses added tokens that are also plain words of the model's vocabulary: a bundle does not state that a token is both."""
     vocab = member(tokenizer.model, "vocab", dict, JSON_FILE)
     for token in tokenizer.added:
         content = token["content"]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A bounded reader of what torch.save writes: a ZIP archive with a pickle and one stored entry for each storage.
+"""A bounded reader of files of torch.save: ZIP archives with a pickle and one uncompressed entry per storage.
 
-The pickle is read as data (pickle_values.py): tensors become positions in the file, every other object an inert record, and nothing
-is imported or executed. Numbers are then read in chunks, as those of a safetensors file are.
+The pickle is read as data (pickle_values.py): tensors become positions in the file, every other object becomes an inert record, and
+nothing is imported or executed. Numbers are read in chunks, as from a safetensors file.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ LOCAL_HEADER, LOCAL_MAGIC = 30, b"PK\3\4"
 
 
 class Stored(NamedTuple):
-    """Where the bytes of a ZIP entry are."""
+    """The position of a ZIP entry's bytes in the file."""
 
     offset: int
     n_bytes: int
 
 
 class Storage(NamedTuple):
-    """What a persistent id names: elements of one type, in one entry of the archive."""
+    """The storage that a persistent id names: elements of one type, in one entry of the archive."""
 
     key: str
     dtype: str
@@ -52,7 +52,7 @@ class Storage(NamedTuple):
 
 class Tensor(NamedTuple):
     storage: Storage
-    first: int  # element of the storage
+    first: int  # index of the tensor's first element in the storage
     shape: Tuple[int, ...]
     stride: Tuple[int, ...]
 
@@ -66,7 +66,7 @@ def _is_count(value) -> bool:
 
 
 def _storage(name) -> object:
-    """("storage", type, key, device, elements). Another kind of persistent id, or of storage, is a value without a meaning."""
+    """The storage of a persistent id ("storage", type, key, device, number of elements); None for another kind of id."""
     if not isinstance(name, tuple) or len(name) != 5 or name[0] != "storage" or not isinstance(name[1], Global):
         return None
     _, kind, key, _, n_element = name
@@ -76,7 +76,7 @@ def _storage(name) -> object:
 
 
 def _tensor(arguments: tuple) -> Tensor:
-    """torch._utils._rebuild_tensor_v2(storage, offset, size, stride, ...)."""
+    """The value of a call torch._utils._rebuild_tensor_v2(storage, offset, size, stride, ...)."""
     if len(arguments) < 4 or not _is_count(arguments[1]) or not _counts(arguments[2]) or not _counts(arguments[3]):
         raise ValueError("a tensor without storage, offset, size and stride")
     if not isinstance(arguments[0], Storage) or len(arguments[2]) != len(arguments[3]):
@@ -94,7 +94,7 @@ CALLS = {"torch._utils _rebuild_tensor_v2": _tensor, "torch._utils _rebuild_para
 
 
 def _entries(path: str) -> Dict[str, Stored]:
-    """Every entry of the archive by name, after comparing its directory with the file."""
+    """Every entry of the archive by name. Checks the archive's directory against the file."""
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         try:
@@ -118,7 +118,7 @@ def _entries(path: str) -> Dict[str, Stored]:
 
 
 def _place(file, info: zipfile.ZipInfo, size: int, where: str) -> Stored:
-    """Behind the entry's own header, whose name and extra field may be longer than the directory's."""
+    """The position of an entry's bytes: after its local header, whose name and extra field may be longer than those in the directory."""
     file.seek(info.header_offset)
     header = file.read(LOCAL_HEADER)
     if len(header) < LOCAL_HEADER or header[:4] != LOCAL_MAGIC:
@@ -146,7 +146,7 @@ def _read(path: str, entry: Stored, where: str) -> bytes:
 
 
 def _position(path: str, name: str, value, entries: Dict[str, Stored], root: str) -> Entry:
-    """A value of the state dictionary as a run of bytes in the file."""
+    """The position of a tensor of the state dictionary in the file. Errors for any other value."""
     where = "{}: tensor {}".format(path, name)
     if not isinstance(value, Tensor):
         raise refuse(where, "a tensor", describe(value), "only the torch functions that rebuild tensors are understood")
@@ -168,7 +168,7 @@ def _position(path: str, name: str, value, entries: Dict[str, Stored], root: str
 
 
 def _content(path: str) -> Tuple[object, Dict[str, Stored], str]:
-    """What was saved, the entries of the archive, and the folder that they are in."""
+    """The saved value, the entries of the archive, and the entries' common folder."""
     entries = _entries(path)
     roots = [name[: -len("data.pkl")] for name in entries if name.endswith("data.pkl") and name.count("/") == 1]
     if len(roots) != 1:
@@ -181,13 +181,14 @@ def _content(path: str) -> Tuple[object, Dict[str, Stored], str]:
 
 
 def read_torch_value(path: str, member: str) -> object:
-    """What the file keeps under `member` beside tensors, None where it has no such member."""
+    """The value of `member` in the saved dictionary, e.g. a config; None if there is none."""
     content, _, _ = _content(path)
     return content.get(member) if isinstance(content, dict) else None
 
 
 def read_torch(path: str, member: str) -> Dict[str, Entry]:
-    """The tensors of the state dictionary that the file keeps under `member`, or is where that is empty; no tensor data is read."""
+    """The tensors of a state dictionary, without their data. `member`: the key of the state dictionary in the saved dictionary; empty if the
+    saved value is the state dictionary itself."""
     (content, entries, root), where = _content(path), path + ": data.pkl"
     state = content.get(member) if isinstance(content, dict) and member else content
     if not isinstance(state, dict) or not state:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Units of states and actions, which no checkpoint states: as --units gives them, compared with the statistics of the training data."""
+"""Units of states and actions, which no checkpoint states: taken from --units and compared with the statistics of the training data."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from .recipe import ACTION, STATE
 
 UNITS = ("rad", "deg", "m", "cm", "mm", "rad/s", "deg/s", "m/s", "N", "Nm", "A", "%", "1")
 NAMES = {STATE: ("observation.state_names", "observation.state_units"), ACTION: ("action.names", "action.units")}
-FEW_TURNS = 4 * math.pi  # a joint that reaches further, in radians, has turned twice
+FEW_TURNS = 4 * math.pi  # radians: two turns of a joint
 EXTREMES = ("min", "max", "q01", "q99", "q10", "q90", "mean")
 
 
 def add_units(plan: Plan, given: str, notes: List[str], problems: Problems) -> None:
-    """`given`: UNIT for all numbers, or NAME=UNIT,...; a name is that of a number, or the feature's for all of its numbers."""
+    """Adds the units to the plan's keys. `given`: UNIT for all numbers, or NAME=UNIT,..., where NAME is a number, or a feature for all of its
+    numbers."""
     keys = {key.name: key for key in plan.keys}
     missing = [key for names in NAMES.values() for key in names if key not in keys]
     if missing and given:
@@ -39,7 +40,7 @@ def add_units(plan: Plan, given: str, notes: List[str], problems: Problems) -> N
 
 
 def _parsed(given: str, problems: Problems) -> Dict[str, str]:
-    """Units by name; that of all numbers under an empty name."""
+    """Units by name; the unit of all numbers has an empty name."""
     chosen: Dict[str, str] = {}
     for part in filter(None, given.split(",")):
         name, _, unit = part.rpartition("=")
@@ -50,7 +51,8 @@ def _parsed(given: str, problems: Problems) -> Dict[str, str]:
 
 
 def _compare(feature: str, names: List[str], units: list, statistics: Dict[str, np.ndarray], notes: List[str]) -> None:
-    """Notes radians that go round and round, degrees that hardly move, and numbers of no stated unit that are large for radians."""
+    """Adds notes about implausible units: radians beyond two turns, degrees that reach at most 2 pi, and numbers without a unit that are too
+    large for radians."""
     prefix = "stats." + feature + "."
     values = [np.asarray(v) for n, v in statistics.items() if n.startswith(prefix) and n[len(prefix) :] in EXTREMES]
     values = [value.reshape(-1, value.shape[-1]) for value in values if value.ndim and value.shape[-1] >= len(names)]

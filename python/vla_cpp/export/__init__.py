@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of `vla serve --record` as files of other programs."""
+"""Exports recordings of `vla serve --record` to file formats of other programs."""

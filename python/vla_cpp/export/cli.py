@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""vla-export: a recording of `vla serve --record`, or the episodes of a control loop, as files that other programs open."""
+"""vla-export: converts a recording of `vla serve --record`, or the episodes of a control loop, to formats of other programs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 class _Acts:
-    """The acts that were asked for; can be gone through again for each format."""
+    """The acts to export; iterable once per format."""
 
     def __init__(self, a: argparse.Namespace) -> None:
         from ..recording import Recording
@@ -126,9 +126,9 @@ def _file(path: Path, write: Any) -> None:
 
 
 def _folder(path: Path, write: Any) -> Any:
-    """Writes beside `path`, and gives it its name when it is whole."""
+    """Writes a folder beside `path` and renames it to `path` when it is complete."""
     part = path.with_name(path.name + ".part")
-    _remove(part)  # of an export that was killed
+    _remove(part)  # left over from a killed export
     try:
         result = write(part)
         os.replace(part, path)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the formats share: names, and pictures as files or as pixels."""
+"""Functions that the export formats share: column names, and pictures as files or as pixels."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ..errors import BadRequest
 
 
 def column_names(names: Sequence[str], width: int) -> List[str]:
-    """Names of a vector's elements; their indices where the bundle has no name for each."""
+    """Names of a vector's elements; their indices if the names are not all present and distinct."""
     named = len(set(names)) == len(names) == width and all(names)
     return list(names) if named else [str(i) for i in range(width)]
 
 
 def picture_file(image: Tuple[str, Any]) -> Tuple[str, bytes]:
-    """("jpeg" or "png", the file). What came as a file stays as it was; pixels become a PNG, which loses nothing."""
+    """("jpeg" or "png", the file). A recorded file is kept unchanged; pixels become a PNG, which is lossless."""
     kind, data = image
     if kind != "rgb":
         return kind, data
@@ -31,7 +31,7 @@ def picture_file(image: Tuple[str, Any]) -> Tuple[str, bytes]:
 
 
 def pixels(image: Tuple[str, Any]) -> np.ndarray:
-    """uint8 (height, width, 3), as the policy saw it."""
+    """The decoded picture, uint8 (height, width, 3)."""
     kind, data = image
     if kind == "rgb":
         return data

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""LeRobot data sets, written by LeRobot itself: of a server's recording a frame for each chunk, with the chunk's first row as its action;
-of a loop's episodes a frame for each control period, with what was commanded."""
+"""Writes LeRobot data sets, with LeRobot's own code. From a server's recording: a frame per chunk, with the chunk's first row as the action.
+From a loop's episodes: a frame per control period, with the commanded action."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ..errors import BadRequest, UsageError, VlaError
 from ..recording import RecordedAct
 from .common import column_names, pixels
 
-MAX_OFF = 0.25  # of a frame's time that the median distance of the acts may differ from it
+MAX_OFF = 0.25  # largest relative difference between a frame's duration and the median interval of the acts
 
 
 def write_lerobot(folder: Path, acts: Iterable[RecordedAct], fps: int, gap_s: float) -> Dict[str, int]:
-    """Frames and episodes that were written. Errors: UsageError (nothing to write, another rate than the recorded one), BadRequest
-    (a frame with other views or sizes than the first)."""
+    """Writes acts; returns the numbers of frames and episodes. Errors: UsageError (nothing to write, or `fps` is not the recorded rate),
+    BadRequest (a frame whose views or sizes differ from the first)."""
     starts = _starts(acts, fps, gap_s)
     data: Optional[LeRobotDataset] = None
     try:
@@ -43,11 +43,12 @@ def write_lerobot(folder: Path, acts: Iterable[RecordedAct], fps: int, gap_s: fl
 
 
 def write_episodes(folder: Path, episodes: Sequence[Episode], only_human: bool) -> Dict[str, int]:
-    """Frames and episodes that were written. Periods without a command are left out; with `only_human` each time that a person drove is
-    an episode. Beside what the policies of LeRobot read, a frame has `action.policy` (NaN where it wanted nothing), `intervention`, and
-    `next.success`, true in the last frame of an episode that somebody called a success.
+    """Writes episodes; returns the numbers of frames and episodes. Periods without a command are left out. With `only_human` each run of
+    periods that a person commanded is an episode. Beside the features that LeRobot's policies read, a frame has `action.policy` (NaN if
+    there is none), `intervention`, and `next.success`, which is true in the last frame of a successful episode.
 
-    Errors: UsageError (nothing to write), BadRequest (an episode of another rate, or with other features than the first).
+    Errors: UsageError (nothing to write, or a rate that is not a whole number), BadRequest (an episode whose rate or features differ from
+    the first).
     """
     data: Optional[LeRobotDataset] = None
     n_frame = n_episode = 0
@@ -112,8 +113,8 @@ def _answered(acts: Iterable[RecordedAct]) -> Iterator[RecordedAct]:
 
 
 def _starts(acts: Iterable[RecordedAct], fps: int, gap_s: float) -> List[bool]:
-    """Whether an episode starts with each act: where the instruction is another, or the robot had paused. Gone through first, since
-    LeRobot counts time in frames: a data set of a wrong rate teaches a wrong speed."""
+    """Whether each act starts an episode: the instruction has changed, or more than `gap_s` seconds have passed. Also checks `fps` against
+    the recorded rate before anything is written: LeRobot counts time in frames, so a wrong rate would teach a wrong speed."""
     seen = [(act.text, act.record.received_ns / 1e9) for act in _answered(acts)]
     if not seen:
         raise UsageError("--lerobot", "acts that were answered with a chunk")

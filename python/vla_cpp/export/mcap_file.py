@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP, for Foxglove, Lichtblick and others: pictures as `foxglove.CompressedImage`, everything else as JSON."""
+"""Writes MCAP files, for Foxglove, Lichtblick and others: pictures as `foxglove.CompressedImage`, everything else as JSON."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _OBJECT = json.dumps({"type": "object"}).encode()
 
 
 def _image_schema() -> descriptor_pb2.FileDescriptorSet:
-    """Foxglove's CompressedImage with what it includes. A reader finds it by name and knows its fields from here."""
+    """The schema of Foxglove's CompressedImage with its imports. A reader identifies it by name and takes the fields from this schema."""
     file = descriptor_pb2.FileDescriptorProto(name="foxglove/CompressedImage.proto", package="foxglove", syntax="proto3")
     file.dependency.append("google/protobuf/timestamp.proto")
     message = file.message_type.add(name="CompressedImage")
@@ -47,7 +47,7 @@ def _image_class(schema: descriptor_pb2.FileDescriptorSet) -> Any:
 
 
 class _File:
-    """Topics of an MCAP file, made when their first message comes."""
+    """The topics of an MCAP file; each is made with its first message."""
 
     def __init__(self, writer: Writer) -> None:
         schema = _image_schema()
@@ -105,7 +105,7 @@ def _action(chunk: Chunk) -> Dict[str, Any]:
 
 
 def _by_name(names: Sequence[str], values: np.ndarray) -> Dict[str, float]:
-    """JSON writes the shortest text of a float64, so that a float32 comes back to the bit."""
+    """The values by name. JSON writes each with enough digits that reading returns the same float32 to the bit."""
     return dict(zip(column_names(names, len(values)), values.tolist()))
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""RRD, for Rerun's viewer."""
+"""Writes RRD files, for Rerun's viewer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .common import column_names, picture_file
 
 
 def write_rrd(path: Path, name: str, spec: Spec, acts: Iterable[RecordedAct]) -> None:
-    """`name` tells recordings of a policy apart."""
+    """Writes acts to an RRD file. `name`: distinguishes recordings of one policy."""
     stream = rerun.RecordingStream("vla_cpp", recording_id=spec.bundle.checksum + name)
     stream.save(str(path))
     named = False

@@ -1,8 +1,11 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""One package or module per architecture, named as in the checkpoint's `type`. Each has `plan(checkpoint, options, problems) -> Plan`,
-`embodiments(checkpoint)`, their tags, where a checkpoint holds several robots, and `LAYOUT` where its authors do not save it as LeRobot does, with the options that
-such a checkpoint leaves open."""
+"""One package or module per architecture, named like the checkpoint's `type`.
+
+plan(checkpoint, options, problems)  the Plan of the bundle
+embodiments(checkpoint)              tags of the robots, if a checkpoint has several
+LAYOUT                               the layout of the architecture's authors, if it is not LeRobot's, with its options
+"""
 
 from __future__ import annotations
 
@@ -21,27 +24,28 @@ from ..options import ACTION_TOKENIZER, COMMON, DOMAIN, IDENTITY_STATS, POSITION
 from ..standardized import Standardized
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
-TERNARY, SCALE = "ternary", "scale"  # of a matrix of -1, 0 and 1 and one factor: its codes, and the factor
+TERNARY, SCALE = "ternary", "scale"  # a matrix of -1, 0 and 1 times a factor: its codes, and the factor
 
 
 class Weight(NamedTuple):
-    """One row of a mapping: the bundle's name, the checkpoint's name, storage class, the checkpoint's shape, the bundle's shape."""
+    """One row of a mapping. target: the bundle's name; source: the checkpoint's name; kind: storage class; stored: the checkpoint's shape;
+    shape: the bundle's shape."""
 
     target: str
     source: str
     kind: str
     stored: Tuple[int, ...]
     shape: Tuple[int, ...]
-    plus_one: bool = False  # a norm of Gemma, which multiplies by 1 + w: the bundle holds the sum, a vector in float32
-    keep_f32: bool = False  # a matrix that the reference keeps in float32 in bfloat16 too: not rounded if stored so
-    first: Optional[int] = None  # of a source that stacks several tensors: the row at which this one's shape[0] rows begin
-    pick: Optional[Tuple[int, Union[int, Sequence[int]]]] = None  # one index of one axis of the source, or several: (axis, index)
-    transpose: bool = False  # what is left after `pick`, stored as (in, out)
-    in_bf16: bool = False  # the reference rounds it to bfloat16 when it loads it, whatever it is stored as
-    batch_norm: str = ""  # a convolution's matrix, or the bias that it gets, with the frozen batch norm of this name behind it
-    pixels: Optional[Standardized] = None  # of a patch embedding and its bias: it reads standardized pixels, the bundle's those from 0 to 1
-    axes: Tuple[int, ...] = ()  # the source's axes in the order in which the bundle has them
-    regroup: int = 0  # the last axis is stored as groups of this many numbers: the bundle has all first ones, all second ones, ...
+    plus_one: bool = False  # a norm that multiplies by 1 + w, as Gemma's: the bundle stores the sum, a float32 vector
+    keep_f32: bool = False  # a matrix that the reference keeps in float32 also in a bfloat16 network: not rounded if stored in float32
+    first: Optional[int] = None  # if the source stacks several tensors: the first of this tensor's shape[0] rows
+    pick: Optional[Tuple[int, Union[int, Sequence[int]]]] = None  # (axis, index): one or several indices of one axis of the source
+    transpose: bool = False  # the result of `pick` is stored as (in, out)
+    in_bf16: bool = False  # the reference rounds it to bfloat16 on loading, from any stored type
+    batch_norm: str = ""  # name of the frozen batch norm that is folded into this convolution's matrix or bias
+    pixels: Optional[Standardized] = None  # for a patch embedding and its bias: the standardization of pixels to fold in
+    axes: Tuple[int, ...] = ()  # permutation of the source's axes to the bundle's order
+    regroup: int = 0  # group size on the source's last axis; the bundle stores all first numbers, then all second ones, ...
 
 
 class Dropped(NamedTuple):
@@ -53,7 +57,7 @@ class Dropped(NamedTuple):
 
 
 class Options(SimpleNamespace):
-    """What a person chose beyond the checkpoint, by the names of options: those of every checkpoint, and those that layouts declare."""
+    """The user's options by name: those of every checkpoint, and those that layouts declare."""
 
     def __init__(self, **chosen: Any) -> None:
         values = {option.name: option.default for option in (*COMMON, *(option for option, _ in declared()))}
@@ -67,17 +71,17 @@ class Options(SimpleNamespace):
 
 @dataclass
 class Plan:
-    """Everything of a bundle but the numbers of the weights."""
+    """Everything in a bundle except the numbers of the weights."""
 
     keys: List[Key]
     weights: List[Weight]
     dropped: List[Dropped]
     statistics: Dict[str, np.ndarray]
-    hints: Dict[str, str] = field(default_factory=dict)  # prefix of an unexpected tensor's name -> why it is not expected
+    hints: Dict[str, str] = field(default_factory=dict)  # prefix of an unexpected tensor's name -> the reason for its refusal
 
 
 def names() -> List[str]:
-    """What has a function `plan`; a package without one holds parts of several architectures."""
+    """The architectures: modules with a function `plan`. A package without it has parts of several architectures."""
     found = (module.name for module in pkgutil.iter_modules(__path__))
     return sorted(name for name in found if callable(getattr(_module(name), "plan", None)))
 
@@ -94,7 +98,7 @@ def load(name):
 
 
 def groot_as_published(checkpoint: Checkpoint, options: Options) -> Options:
-    """Of LeRobot's GR00T: the checkpoint in the authors' layout."""
+    """Converts a checkpoint of LeRobot's GR00T in place to the authors' layout. Returns the options with the checkpoint's only robot."""
     return _module("gr00t.lerobot_layout").as_published(checkpoint, options)
 
 
@@ -112,7 +116,7 @@ LAYOUTS = {
 
 
 def told_by_files() -> Dict[str, Layout]:
-    """The layouts that have a reader or files of their own."""
+    """The layouts with their own reader or files."""
     return {**authors(), OPENPI: LAYOUTS[OPENPI]}
 
 
@@ -130,7 +134,7 @@ def declared() -> List[Tuple[Option, Dict[str, str]]]:
     return list(found.values())
 
 
-# What names of tensors of a LeRobot policy begin with, that no other one has.
+# Prefixes of tensor names that identify a LeRobot policy: only this one has all of them.
 PALIGEMMA = "model.paligemma_with_expert."
 TELLING = {
     "smolvla": ("model.vlm_with_expert.",),
@@ -146,7 +150,7 @@ TELLING = {
 
 
 def told_by_tensors(checkpoint: Checkpoint) -> None:
-    """Of a LeRobot config without a type: the only architecture that has its tensors."""
+    """Sets the type in a LeRobot config without one, if the tensor names match exactly one architecture."""
     names = list(checkpoint.tensors)
     found = [arch for arch, all_of in TELLING.items() if all(any(name.startswith(one) for name in names) for one in all_of)]
     if len(found) == 1 and "type" not in checkpoint.config and "model_type" not in checkpoint.config:
@@ -155,7 +159,7 @@ def told_by_tensors(checkpoint: Checkpoint) -> None:
 
 
 def check_options(layout: str, config: dict, options: Options) -> None:
-    """Refuses options that a layout does not leave open. Errors: usage."""
+    """Refuses options that the layout does not declare. Errors: usage."""
     problems, own = Problems("arguments"), {**LAYOUTS, **authors()}[layout].name
     for option, layouts in declared():
         if getattr(options, option.name) and own not in layouts:
@@ -171,8 +175,8 @@ def check_options(layout: str, config: dict, options: Options) -> None:
 
 
 def arch_of(checkpoint: Checkpoint, variant: str) -> str:
-    """LeRobot states the architecture; in an openpi checkpoint nothing does, and `variant` names the configuration that it
-    was trained with, or a file that states it. Errors: usage, unsupported."""
+    """The checkpoint's architecture. LeRobot's config states it; for openpi's layout `variant` names the training configuration, or a file
+    with one. Errors: usage, unsupported."""
     config, layout = checkpoint.config, checkpoint.layout
     if layout == LEROBOT and "type" not in config and "model_type" in config:
         known = dict.fromkeys(name for each in authors().values() for name in each.model_types)

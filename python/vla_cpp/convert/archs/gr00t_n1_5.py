@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """GR00T N1.5: Eagle 2.5 as the prefix, self-attention over its features, a diffusion transformer with future tokens.
 
-The layout is the authors' (Isaac-GR00T, last in November 2025): config.json, weights, experiment_cfg/metadata.json with the statistics of
-every robot. Which keys a robot has, in which order, and how they are normalized is defined by a class of their code, chosen when a
-server starts: here --variant names it, or a JSON file with the same content.
+The layout is the authors' (Isaac-GR00T, last in November 2025): config.json, weights, and experiment_cfg/metadata.json with the statistics of
+every robot. A class in the authors' code, chosen when a server starts, defines a robot's keys, their order and their normalization; --variant
+names this class, or a JSON file with the same content.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ TOP_IGNORED = set(
 )
 BACKBONE_FIXED: Fixed = {"project_to_dim": (1536, None), "reproject_vision": (False, False)}
 BACKBONE_IGNORED = {"tune_llm", "tune_visual", "eagle_path", "use_flash_attention", "load_bf16"}
-# FlowmatchingActionHeadConfig, of whose sizes none has the published checkpoint's value by default: they must be stated.
+# Keys of FlowmatchingActionHeadConfig. Its default sizes differ from the published checkpoint's, so the sizes must be stated.
 HEAD = dict.fromkeys(
     """max_state_dim action_dim action_horizon hidden_size input_embedding_dim backbone_embedding_dim num_inference_timesteps\n    num_target_vision_tokens diffusion_model_cfg vl_self_attention_cfg""".split()
 )
@@ -51,7 +51,7 @@ HEAD_IGNORED = set(
     detection_coeff freeze_decode_layer expand_batch vl_self_attention_dtype model_type""".split()
 )
 EMBODIMENTS = {"new_embodiment": 31, "oxe_droid": 17, "agibot_genie1": 26, "gr1": 24}
-# Modes of a key with the recipe's kind and the statistics that it takes; a key without a mode passes as it is.
+# Mode of a key -> the recipe's kind and the statistics that it reads; a key without a mode is not normalized.
 MODES = {
     "min_max": ("groot_n1_5_min_max", ("min", "max")),
     "q99": ("groot_n1_5_quantiles", ("q01", "q99")),
@@ -61,24 +61,24 @@ MODES = {
     None: ("", ("min", "max")),
 }
 EULER = tuple("euler_angles_" + order for order in "rpy ryp pry pyr yrp ypr".split())
-ROTATIONS = {"quaternion": 4, **dict.fromkeys(("axis_angle", *EULER), 3)}  # representations, and how many numbers they have
+ROTATIONS = {"quaternion": 4, **dict.fromkeys(("axis_angle", *EULER), 3)}  # representations -> number of numbers
 EDGE, CROP, HORIZON = 224, 0.95, 16
 
 
 class DataConfig(NamedTuple):
-    """What a robot sends and gets, and how its numbers are normalized."""
+    """A robot's cameras, states and actions, and their normalization."""
 
     video: Tuple[str, ...]
     state: Dict[str, Optional[str]]  # key -> mode
     action: Dict[str, Optional[str]]
     horizon: int = HORIZON
     crop: float = CROP
-    index: int = -1  # of the robot among those of the weights, where its tag does not say it
-    rotations: Mapping[str, str] = MappingProxyType({})  # state.KEY or action.KEY -> what the network has it as
+    index: int = -1  # the robot's index in the weights; -1: its tag determines it
+    rotations: Mapping[str, str] = MappingProxyType({})  # state.KEY or action.KEY -> the network's representation of the rotation
 
 
 def _modes(keys: str) -> Dict[str, Optional[str]]:
-    """KEY or KEY:MODE, one after the other."""
+    """Modes by key, from KEY or KEY:MODE, separated by blanks."""
     return {key: mode or None for key, _, mode in (entry.partition(":") for entry in keys.split())}
 
 
@@ -90,7 +90,7 @@ ARMS = "left_arm right_arm left_hand right_hand"
 XYZ = "x y z roll pitch yaw"
 AGIBOT = "left_arm_joint_position right_arm_joint_position left_effector_position right_effector_position head_position waist_position"
 TWO_ARMS = dict.fromkeys(("state.right_arm_eef_quat", "state.left_arm_eef_quat"), "rotation_6d")
-# gr00t/experiment/data_config.py and examples/Libero/custom_data_config.py of Isaac-GR00T.
+# The data configs in Isaac-GR00T's gr00t/experiment/data_config.py and examples/Libero/custom_data_config.py.
 CONFIGS = {
     "fourier_gr1_arms_only": DataConfig(("ego_view",), _all(ARMS, "sin_cos"), _all(ARMS)),
     "fourier_gr1_arms_waist": DataConfig(("ego_view",), _all(ARMS + " waist", "sin_cos"), _all(ARMS + " waist")),
@@ -171,12 +171,12 @@ def _plan_of_lerobot(checkpoint: Checkpoint, options: Options, problems: Problem
 
 
 def embodiments(checkpoint: Checkpoint) -> List[str]:
-    """Tags of the robots that the checkpoint of the authors describes."""
+    """Tags of the robots in the authors' checkpoint."""
     return list(read_json(checkpoint.path(METADATA)))
 
 
 def _read_horizon(config: DataConfig, s: Sizes, problems: Problems) -> None:
-    """The data config's, whatever the head's own config says: the authors' Gr00tPolicy._load_model rebuilds the head with as many
+    """Sets the horizon from the data config, not from the head's config: the authors' Gr00tPolicy._load_model rebuilds the head with as many
     rows as the data config has delta_indices, and every row of a chunk attends to all others."""
     s.horizon = config.horizon
     if s.horizon > s.n_position:
@@ -193,7 +193,7 @@ def weights(s: Sizes, n_future: int) -> Rows:
 
 
 def _data_config(checkpoint: Checkpoint, name: str) -> DataConfig:
-    """A JSON file: a path, or a file name in the checkpoint."""
+    """The data config of that name, or in a JSON file: a path, or a file name in the checkpoint."""
     if name in CONFIGS:
         return CONFIGS[name]
     if not name.endswith(".json"):
@@ -280,9 +280,10 @@ def _group(part: str, key: str, mode: Optional[str], metadata: dict, rotations: 
 
 
 def _converted(group: Group, part: str, mode: Optional[str], target: str, described: dict, place: str, problems: Problems) -> Group:
-    """A rotation that the network has in another representation than the robot. Statistics are those of the robot's, so that only an
-    absolute one is normalized, by the bounds of the network's. On other pairs the reference fails, mostly since it counts with the
-    robot's width, but for other pairs of Euler angles and axis_angle, which no data config of it has."""
+    """The group of a rotation that the network has in another representation than the robot. Statistics describe the robot's representation,
+    so only an absolute rotation can be normalized, by the bounds of the network's representation. The reference fails on most other pairs of
+    representations, since it uses the robot's width; it would accept further pairs of Euler angles and axis_angle, but no data config has
+    them."""
     source = described.get("rotation_type")
     pairs = {("state", name, "rotation_6d"): width for name, width in ROTATIONS.items()}
     pairs.update({("action", name, "axis_angle"): 3 for name in EULER})

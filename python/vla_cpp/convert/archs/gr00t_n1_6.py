@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""GR00T N1.6: Eagle 3 as the prefix, a diffusion transformer that reads its text and its images in turns.
+"""GR00T N1.6: Eagle 3 as the prefix, and a diffusion transformer whose layers attend alternately to text and images.
 
-The layout is the authors' (Isaac-GR00T), as of N1.7. An absent key of config.json means the default of their own class.
+The layout is the authors' (Isaac-GR00T), as for N1.7. An absent key of config.json has the default of the authors' own class.
 """
 
 from __future__ import annotations

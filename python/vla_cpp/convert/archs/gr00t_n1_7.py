@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""GR00T N1.7: Qwen3-VL as the prefix, a diffusion transformer that reads its text and its images in turns.
+"""GR00T N1.7: Qwen3-VL as the prefix, and a diffusion transformer whose layers attend alternately to text and images.
 
-A checkpoint holds several robots, a bundle those that --embodiment names. The layout is the authors' (Isaac-GR00T).
+A checkpoint has several robots, and a bundle those that --embodiment names. The layout is the authors' (Isaac-GR00T).
 
-An absent key of config.json means the default of the authors' own class, which is stated here beside the key. LeRobot's copy of that
-class has other defaults for `select_layer`, `diffusion_model_cfg` and `vl_self_attention_cfg`, those of the published checkpoint; where a
-checkpoint leaves one of them out, its tensors fit the one or the other, and what does not fit is refused.
+An absent key of config.json has the default of the authors' own class, listed here with the key. LeRobot's copy of that class has other
+defaults for `select_layer`, `diffusion_model_cfg` and `vl_self_attention_cfg`: those of the published checkpoint. If a checkpoint omits one
+of them and its tensors do not fit the authors' default, it is refused.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RELEASE = Release(
         "action_horizon": 40,
         "diffusion_model_cfg": {**DIT, "num_layers": 16},
         "vl_self_attention_cfg": None,
-        "rtc_ramp_rate": 6.0,  # of LeRobot's class; the authors' callers give it
+        "rtc_ramp_rate": 6.0,  # the default of LeRobot's class; in the authors' code the caller passes it
         "model_name": "nvidia/Cosmos-Reason2-2B",
     },
     fixed={"exclude_state": (False, False), "strict_action_padding_mask": (False, False), "use_tactile": (False, False)},

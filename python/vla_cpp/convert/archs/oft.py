@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What BitVLA and OpenVLA-OFT share: the files that openvla-oft's trainer writes beside a language model, the images of its evaluation,
-the numbers of a robot, and the action head.
+"""The common part of the policies of openvla-oft's trainer (BitVLA, OpenVLA-OFT, VLA-Adapter): its files beside a language model, the image
+ops of its evaluation, the statistics of a robot, and the action head.
 
 Reference: moojink/openvla-oft (vla-scripts/finetune.py, experiments/robot/{openvla_utils,robot_utils}.py, prismatic/models/action_heads.py,
 projectors.py).
@@ -26,17 +26,17 @@ from ..torch_file import read_torch
 STATISTICS = "dataset_statistics.json"
 HEAD, PROPRIO = "action_head.", "proprio_projector."
 N_HEAD_LAYER = 2  # a literal of the action head
-GRIPPER = 6  # of LIBERO, from 0, closed, to 1, open; its simulator opens it by -1
-VIEWS, ALIASES = ("image", "image2"), ("full_image", "wrist_image")  # LeRobot's names of LIBERO's cameras, and the reference's
+GRIPPER = 6  # column of LIBERO's gripper, from 0 (closed) to 1 (open); for LIBERO's simulator -1 means open
+VIEWS, ALIASES = ("image", "image2"), ("full_image", "wrist_image")  # names of LIBERO's cameras in LeRobot and in the reference
 CROP, EPS, JPEG_QUALITY = 0.9, 1e-8, 95
 PLAIN_IMAGES = Option("--plain-images", "images do not go through a JPEG of quality 95, as they do in the authors' evaluation", default=False)
 
 
 def read_parts(folder: str, tensors: Tensors, required: Sequence[str], optional: Sequence[str], problems: Problems) -> None:
-    """Adds those of a file of each part, under its name, without what DistributedDataParallel puts in front."""
+    """Adds the tensors of each part's file, with the part's name as prefix instead of DistributedDataParallel's."""
     steps: Dict[str, str] = {}
     for part in (*required, *optional):
-        pattern = re.compile(re.escape(part) + r"--(?:(.+)_)?checkpoint\.pt")  # on the hub also without a step
+        pattern = re.compile(re.escape(part) + r"--(?:(.+)_)?checkpoint\.pt")  # files on the hub may have no step
         found = {name: match[1] or "" for name in sorted(os.listdir(folder)) for match in [pattern.fullmatch(name)] if match}
         if not found and part in optional:
             continue
@@ -58,7 +58,7 @@ def read_parts(folder: str, tensors: Tensors, required: Sequence[str], optional:
 
 
 def dim(checkpoint: Checkpoint, name: str, axis: int, problems: Problems) -> int:
-    """A side of a matrix, which tells the width of a robot's numbers."""
+    """The length of a matrix along `axis`, which gives the width of a robot's state or action."""
     entry = checkpoint.tensors.get(name)
     if entry is not None and len(entry.shape) == 2:
         return entry.shape[axis]
@@ -69,8 +69,8 @@ def dim(checkpoint: Checkpoint, name: str, axis: int, problems: Problems) -> int
 def ranges(
     stated: dict, where: str, widths: Dict[str, int], names: Tuple[str, str], problems: Problems
 ) -> Tuple[Dict[str, np.ndarray], List[bool]]:
-    """Lowest and highest numbers, in float64 as the reference reads them, and which columns of an action are normalized. `widths`: by
-    feature, 0 where the policy has none."""
+    """The statistics `names`, in float64 as in the reference, and which columns of an action are normalized. `widths`: by feature; 0 if the
+    policy does not have the feature."""
     tensors: Dict[str, np.ndarray] = {}
     for feature, key in ((recipe.STATE, "proprio"), (recipe.ACTION, "action")):
         for name in names if widths[feature] else ():
@@ -91,8 +91,8 @@ def ranges(
 
 
 def image_ops(side: int, plain: bool) -> List[dict]:
-    """From what a client of the reference gets. It passes images through a JPEG first (resize_image_for_policy), as the data were that it
-    was trained on; `plain`: not that. Of LIBERO they are turned by 180 degrees, as its clients do."""
+    """The image ops, for the frames that a client of the reference gets. The client first passes them through JPEG (resize_image_for_policy),
+    like the training data; `plain`: without this. LIBERO's frames must be rotated by 180 degrees before, as its clients do."""
     size = {"width": side, "height": side}
     return [
         *([] if plain else [{"op": "jpeg", "quality": JPEG_QUALITY}]),
@@ -111,7 +111,7 @@ def state_ops(kind: str, d_state: int) -> List[dict]:
 
 
 def action_ops(kind: str, mask: List[bool], moves_libero: bool) -> List[dict]:
-    """`moves_libero`: the gripper as LIBERO's simulator takes it."""
+    """The action ops. `moves_libero`: convert the gripper to the sign that LIBERO's simulator expects."""
     columns = [i for i, on in enumerate(mask) if on]
     gripper = [{"op": "affine", "columns": [GRIPPER], "scale": -2.0, "shift": 1.0}, {"op": "sign", "columns": [GRIPPER]}]
     return [
@@ -121,19 +121,20 @@ def action_ops(kind: str, mask: List[bool], moves_libero: bool) -> List[dict]:
 
 
 def in_bf16(rows: Rows) -> Rows:
-    """Trained in float32; the reference rounds them when it loads them."""
+    """The rows with rounding to bfloat16: they are trained in float32, and the reference rounds them on loading."""
     return [row._replace(in_bf16=True) for row in rows]
 
 
 def projector(target: str, source: str, d: int, d_in: int) -> Rows:
-    """Numbers to a token."""
+    """A projector of `d_in` numbers to a token."""
     return in_bf16(linear(target + "_in", source + "fc1", d, d_in) + linear(target + "_out", source + "fc2", d, d))
 
 
 def head(
     source: str, d: int, d_action: int, n_layer: int = N_HEAD_LAYER, attention: Callable[[str, str], Rows] = lambda target, source: []
 ) -> Rows:
-    """The MLP-ResNet below `source`, which ends in a dot. `attention`: rows that a block has in front of its MLP, below both its names."""
+    """The MLP-ResNet with the prefix `source`, which ends in a dot. `attention`: rows of a block before its MLP, from the block's prefixes in
+    bundle and checkpoint."""
     d_in = d_action * d
     rows = norm("head.in_norm", source + "layer_norm1", d_in) + linear("head.in", source + "fc1", d, d_in)
     for i in range(n_layer):

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""π0.5: as π0, but the discretized state is part of the prompt, and time enters the expert through its norms.
+"""π0.5: like π0, but the discretized state is part of the prompt, and the time enters the expert through its norms.
 
-Reference: lerobot src/lerobot/policies/pi05 and openpi src/openpi/models_pytorch; what it shares with π0 is in pi0/.
+Reference: lerobot src/lerobot/policies/pi05 and openpi src/openpi/models_pytorch. pi0/ has the common part with π0.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""π0-FAST: PaliGemma answers with tokens, which FAST decodes to a chunk; no expert, and the state stands in the prompt.
+"""π0-FAST: PaliGemma generates tokens, which FAST decodes to a chunk; there is no expert, and the state is part of the prompt.
 
-Reference: lerobot src/lerobot/policies/pi0_fast; what it shares with π0 and π0.5 is in pi0/.
+Reference: lerobot src/lerobot/policies/pi0_fast. pi0/ has the common part with π0 and π0.5.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .pi0.layouts import BINS, CLEAN
 from .pi0.mapping import EMBEDDING, LM, LM_HEAD, VISION, Sizes, canonical, check_image, paligemma, read_paligemma, rename, rounded
 
 ACTION_TOKENIZER, FOLDER = "lerobot/fast-action-tokenizer", "action_tokenizer"
-# The defaults of the class.
+# Keys of config.json with the defaults of the reference's class.
 CONFIG: Dict[str, object] = {
     "paligemma_variant": "gemma_2b",
     "dtype": "float32",
@@ -44,8 +44,8 @@ CONFIG: Dict[str, object] = {
     "validate_action_token_prefix": True,
 }
 FIXED = {"temperature": (0.0, "the runtime takes the likeliest token and draws none")}
-# Keys that no number of an action chunk depends on: the reference reads them in training alone, or the pipelines state them; without its
-# cache it computes the same.
+# Keys without effect on the numbers of an action chunk: the reference reads them only in training, or the pipelines state them; its cache does
+# not change results.
 IGNORED = set(
     """
     action_expert_variant tokenizer_max_length text_tokenizer_name action_tokenizer_name max_action_tokens use_kv_cache
@@ -55,7 +55,7 @@ IGNORED = set(
 STEPS: recipe.Steps = {
     recipe.PRE: {
         "pi0_fast_prepare_state_tokenizer_processor_step": {"max_state_dim": recipe.ANY, "task_key": ("task",)},
-        # Of training: an observation brings no action.
+        # Only training uses this step: an observation has no action.
         "action_tokenizer_processor": {"trust_remote_code": recipe.ANY, "max_action_tokens": recipe.ANY, "action_tokenizer_name": recipe.ANY},
         **recipe.RELATIVE[recipe.PRE],
     },
@@ -84,7 +84,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         checkpoint.adapter = checkpoint.adapter.renamed(lambda name: canonical(name, "time_mlp", "time_mlp"))
     text = _with_bos(read_tokenizer(given_tokenizer(checkpoint, options, processors, TOKENIZER), sizes.lm.n_vocab, problems, checkpoint.notes), problems)
     actions = read_action_tokens(_action_tokenizer(checkpoint, options), text, sizes.lm.n_vocab, spoken, problems)
-    max_tokens = processors.max_tokens + 1  # which does not count the token behind the prompt
+    max_tokens = processors.max_tokens + 1  # the reference's limit does not count the token after the prompt
     tokenize = {"op": "tokenize", "max_tokens": max_tokens, "truncate": text.truncate}
     document = {
         "image": [
@@ -142,7 +142,7 @@ def _sizes(policy: Section, checkpoint: Checkpoint, options: Options, problems: 
 
 
 def _with_bos(text: TokenizerPlan, problems: Problems) -> TokenizerPlan:
-    """The reference puts the token of a beginning behind the prompt too, and drops no more of that for it."""
+    """The tokenizer with <bos> after the prompt too, as in the reference, which truncates the prompt without counting this token."""
     front = next((key.value for key in text.keys if key.name == "tokenizer.prefix_ids"), [])
     if not isinstance(front, list) or len(front) != 1 or text.tokens[front[0]] != "<bos>":
         problems.unsupported("tokenizer", "<bos> in front of every text, as PaliGemma's has", repr(front))
@@ -151,7 +151,7 @@ def _with_bos(text: TokenizerPlan, problems: Problems) -> TokenizerPlan:
 
 
 def _action_tokenizer(checkpoint: Checkpoint, options: Options) -> str:
-    """The folder of --action-tokenizer, or that of the checkpoint. Errors: I/O."""
+    """The folder of --action-tokenizer, else the one in the checkpoint. Errors: I/O."""
     given = options.action_tokenizer
     hub = hub_folder(given, ACTION_TOKENIZER_PATTERNS)
     if hub:

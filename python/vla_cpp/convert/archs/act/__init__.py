@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""ACT: what its checkpoint states, as keys and tensors of a bundle.
+"""Converts checkpoints of ACT to keys and tensors of a bundle.
 
 Reference: lerobot src/lerobot/policies/act (configuration_act.py, modeling_act.py, processor_act.py) and torchvision models/resnet.py.
 """
@@ -35,8 +35,8 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def recipe_document(s: Sizes, processors: recipe.Processors, problems: Problems) -> Dict[str, List[dict]]:
-    """The reference resizes nothing: frames of another size than the data set's are refused. Frames of several sizes lie in the corner of
-    images of one size, out of which the network takes them."""
+    """The recipe. The reference does not resize, so frames must have the data set's size. If the views' sizes differ, each frame is placed in
+    the corner of an image of the largest size, and the network reads only the frame's part."""
     width, height = s.frame
     size = {"width": width, "height": height}
     several = len(set(s.frames)) > 1

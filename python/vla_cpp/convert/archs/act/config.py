@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of an ACT policy from its config.json, and everything in it that the runtime cannot honour.
+"""Sizes of an ACT policy from its config.json, with refusals of everything that the runtime does not support.
 
-An absent key means the default of the reference's own class, which is stated here beside the key.
+An absent key has the default of the reference's own class, listed here with the key.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ...section import Section
 from .. import Options
 
 ENVIRONMENT = "observation.environment_state"
-# ACTConfig's keys that numbers depend on, with the defaults of the class.
+# ACTConfig keys with effect on numbers, with the class's defaults.
 POLICY = {
     "chunk_size": 100,
     "n_action_steps": 100,
@@ -37,9 +37,9 @@ POLICY = {
     "normalization_mapping": {"VISUAL": "MEAN_STD", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"},
 }
 FIXED = {"replace_final_stride_with_dilation": (False, "torchvision has no ResNet-18 or -34 with dilation either")}
-# Keys that no number of an action chunk depends on, beside those of every policy of LeRobot.
+# Keys without effect on the numbers of an action chunk, beside those of every LeRobot policy.
 IGNORED = set("pretrained_backbone_weights dropout kl_weight optimizer_lr_backbone".split())
-# torchvision models/resnet.py: blocks of each stage. Those of the others have another block.
+# torchvision models/resnet.py: number of blocks per stage. Other ResNets have a different kind of block.
 BACKBONES = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
 ACTIVATIONS = {"relu": "relu", "gelu": "gelu_erf"}
 MAX_LAYERS, MAX_SIDE, MAX_VIEWS = 512, 8192, 64
@@ -48,8 +48,8 @@ MAX_LAYERS, MAX_SIDE, MAX_VIEWS = 512, 8192, 64
 @dataclass
 class Sizes:
     views: Sequence[str]
-    frame: Tuple[int, int]  # width, height of the images: the largest sides of the views' frames
-    frames: Sequence[Tuple[int, int]]  # of each view
+    frame: Tuple[int, int]  # width, height of the images: the largest width and height over the views' frames
+    frames: Sequence[Tuple[int, int]]  # width, height of each view's frames
     d_state: int
     d_environment: int  # 0: there is none
     d_action: int
@@ -62,7 +62,7 @@ class Sizes:
     pre_norm: bool
     n_encoder: int
     n_decoder: int
-    has_vae: bool  # of training alone
+    has_vae: bool  # the checkpoint has a VAE encoder, which only training uses
     d_latent: int
     n_vae: int
 
@@ -119,11 +119,11 @@ def _check_words(policy: Section) -> None:
             policy.bad(key, "true or false")
     if not isinstance(policy.get("normalization_mapping"), dict):
         policy.bad("normalization_mapping", "the modes of VISUAL, STATE and ACTION")
-    policy.values.setdefault("normalization_mapping", POLICY["normalization_mapping"])  # for those who read it of the older layout
+    policy.values.setdefault("normalization_mapping", POLICY["normalization_mapping"])  # readers of the older layout use it
 
 
 def _note_ensemble(policy: Section, checkpoint: Checkpoint) -> None:
-    """How chunks become commands is the client's matter, here as for every policy: a bundle gives chunks."""
+    """Notes temporal ensembling: a bundle only produces chunks, and the client blends them."""
     coefficient = policy.get("temporal_ensemble_coeff")
     if coefficient is None:
         return
@@ -140,7 +140,7 @@ def _note_ensemble(policy: Section, checkpoint: Checkpoint) -> None:
 
 
 def cameras_of(policy: Section) -> Tuple[Sequence[str], Sequence[Tuple[int, int]]]:
-    """Cameras in their order, and the sizes of their frames. What the reference does not read is refused: it may be a misspelt feature."""
+    """Cameras in order, and (width, height) of their frames. Refuses features that the reference does not read, since they may be misspelt."""
     features = policy.get("input_features")
     views, sizes = [], []
     for name, feature in (features if isinstance(features, dict) else {}).items():

@@ -13,7 +13,7 @@ from .. import MATRIX, VECTOR, Dropped, Weight
 from .config import Sizes
 
 BACKBONE = "model.backbone."
-WIDTHS = (64, 128, 256, 512)  # of ResNet's stages
+WIDTHS = (64, 128, 256, 512)  # widths of ResNet's stages
 VAE = "the encoder of the style variable is for training"
 ENCODER = Names("self_attn.in_proj_ self_attn.out_proj", "linear1 linear2", "norm1 norm2")
 DECODER = ENCODER._replace(norms="norm1 norm2 norm3", cross="multihead_attn.in_proj_ multihead_attn.out_proj")
@@ -35,7 +35,7 @@ def network_keys(s: Sizes) -> List[Key]:
 
 
 def of_views(s: Sizes) -> Dict[str, List[int]]:
-    """Sizes of the views' frames, where they are not all the images'."""
+    """The key with the sizes of the views' frames, if they differ."""
     return {"view_sizes": [side for size in s.frames for side in size]} if len(set(s.frames)) > 1 else {}
 
 
@@ -46,7 +46,7 @@ def weights(s: Sizes) -> Rows:
         Weight("projector.weight", "model.encoder_img_feat_input_proj.weight", MATRIX, (d, WIDTHS[-1], 1, 1), (d, WIDTHS[-1])),
         *vector("projector.bias", "model.encoder_img_feat_input_proj.bias", d),
         *table("position", "model.encoder_1d_feature_pos_embed.weight", 3 if s.d_environment else 2, d),
-        # The style variable is zero: its projection is the bias.
+        # The style variable is zero, so its projection equals the bias.
         *vector("style.weight", "model.encoder_latent_input_proj.bias", d),
         *linear("state_in", "model.encoder_robot_state_input_proj", d, s.d_state),
         *table("query", "model.decoder_pos_embed.weight", s.horizon, d),
@@ -61,7 +61,8 @@ def weights(s: Sizes) -> Rows:
 
 
 class Named(NamedTuple):
-    """A convolution of a ResNet: the bundle's name, torchvision's names of it and of the norm behind it, widths, side of the window."""
+    """A convolution of a ResNet. target: the bundle's name; source, norm: torchvision's names of the convolution and of the norm after it;
+    d_out, d_in: widths; size: side of the kernel."""
 
     target: str
     source: str
@@ -72,7 +73,7 @@ class Named(NamedTuple):
 
 
 def resnet_convolutions(n_block: Sequence[int], renamed: Mapping[str, str] = {}) -> List[Named]:
-    """`renamed`: what a checkpoint calls torchvision's modules."""
+    """The convolutions of a ResNet. `renamed`: torchvision's module names -> the checkpoint's."""
     found = [Named("stem", "conv1", "bn1", WIDTHS[0], 3, 7)]
     d_in = WIDTHS[0]
     for stage, (n, d_out) in enumerate(zip(n_block, WIDTHS)):
@@ -99,7 +100,7 @@ def resnet(n_block: Sequence[int]) -> Rows:
 
 
 def convolution(target: str, source: str, batch_norm: str, d_out: int, d_in: int, size: int) -> Rows:
-    """With the frozen batch norm behind it, which becomes part of matrix and bias."""
+    """A convolution with the frozen batch norm after it, which is folded into matrix and bias."""
     folded = dict(batch_norm=BACKBONE + batch_norm)
     stored, shape = (d_out, d_in, size, size), (d_out, size * size * d_in)
     return [
@@ -109,7 +110,7 @@ def convolution(target: str, source: str, batch_norm: str, d_out: int, d_in: int
 
 
 def dropped(s: Sizes) -> List[Dropped]:
-    """What training alone reads."""
+    """Tensors that only training reads."""
     style = "the style variable is zero outside of training"
     rows = [Dropped("model.encoder_latent_input_proj.weight", (s.d_model, s.d_latent), style)]
     if not s.has_vae:

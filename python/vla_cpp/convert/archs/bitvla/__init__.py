@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""BitVLA: a SigLIP tower and BitNet b1.58, both of ternary weights, that fill the slots of a whole chunk in one pass, and an MLP-ResNet.
+"""BitVLA: a SigLIP tower and BitNet b1.58, both with ternary weights, that compute the slots of a whole chunk in one pass, and an MLP-ResNet.
 
-A fine-tune is a folder: config.json, bfloat16 master weights, tokenizer and processor files, dataset_statistics.json, and the action head
-and the proprio projector in a file of torch.save each. The robot is a set of constants in their code, chosen by the command line of
-a training run; the widths of head and projector identify it.
+A fine-tune is a folder: config.json, bfloat16 master weights, tokenizer and processor files, dataset_statistics.json, and one torch.save file
+each for the action head and the proprio projector. A robot is a set of constants in the authors' code, chosen by the command line of a
+training run; the widths of head and projector identify it.
 
 Reference: ustcwhy/BitVLA openvla-oft (experiments/robot/{bitnet_utils,openvla_utils,robot_utils}.py, prismatic/vla/constants.py,
 bitvla/bitnet_action_tokenizer.py, convert_ckpt.py).
@@ -32,15 +32,15 @@ from .. import Options, Plan, oft
 from .mapping import HEAD, PROPRIO, Sizes, dropped, network_keys, read_sizes, weights
 
 PROCESSOR, IMAGES = "processor_config.json", "preprocessor_config.json"
-HORIZONS = {(8, 7): 8}  # of LIBERO, by numbers of states and actions
+HORIZONS = {(8, 7): 8}  # (width of the state, width of the action) -> rows of a chunk; this is LIBERO
 BOS, STOP, END, IMAGE, STATE = "<|begin_of_text|>", "<|end_of_text|>", "<|eot_id|>", "<|image_pad|>", "<proprio_pad>"
 QUESTION = "What action should the robot take to {instruction}?"
-# What convert_ckpt.py puts behind the system's sentence: one message of a user, and the start of the assistant's.
+# The template of convert_ckpt.py after the system's sentence: one user message, and the start of the assistant's.
 TEMPLATE = (
     "{% set loop_messages = messages %}{% for message in loop_messages %}{% set content = message['role'] | capitalize + ': '"
     "+ message['content'] | trim + '<|eot_id|>' %}{{ content }}{% endfor %}{% if add_generation_prompt %}{{ 'Assistant: ' }}{% endif %}"
 )
-N_INSTRUCTION = 512  # tokens, far above any instruction: the reference cuts none
+N_INSTRUCTION = 512  # tokens; far above any instruction, since the reference truncates none
 IMAGES_FIXED: Fixed = {
     "do_resize": (True, True),
     "do_rescale": (True, True),
@@ -62,9 +62,9 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     statistics, mask = _statistics(checkpoint, options.stats, s, problems)
     _check_images(checkpoint, s, problems)
     tokenizer = read_tokenizer(checkpoint.folder, s.lm.n_vocab, problems, checkpoint.notes)
-    problems.raise_any()  # a prompt takes a sound tokenizer
+    problems.raise_any()  # the prompt needs a valid tokenizer
     text, prompt_keys = _prompt(checkpoint, tokenizer, s, problems)
-    kind = "openpi_quantiles"  # the same formula, on statistics in float64
+    kind = "openpi_quantiles"  # the formula is the same, with statistics in float64
     document = {
         "image": image_ops(s.vision.image_size, options.plain_images),
         "text": text,
@@ -88,7 +88,7 @@ def image_ops(side: int, plain: bool) -> List[dict]:
 
 
 def _read_tensors(folder: str, problems: Problems) -> Tensors:
-    """The language model's, and those of both files beside it."""
+    """The tensors of the language model, and of the two files beside it."""
     tensors = read_stored(folder, problems)
     oft.read_parts(folder, tensors, ("action_head", "proprio_projector"), (), problems)
     return tensors
@@ -120,7 +120,7 @@ def _read_robot(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> None:
 
 
 def _statistics(checkpoint: Checkpoint, name: str, s: Sizes, problems: Problems) -> Tuple[Dict[str, np.ndarray], List[bool]]:
-    """In float64, as the reference reads them, and which columns of an action are normalized."""
+    """The statistics, in float64 as in the reference, and which columns of an action are normalized."""
     everything = read_json(checkpoint.path(oft.STATISTICS))
     if name not in everything and (name or len(everything) != 1):
         hint = "--stats NAME, the data set that the policy was tuned on"
@@ -154,7 +154,7 @@ def _check_images(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> None:
 
 
 def _system_sentence(checkpoint: Checkpoint, problems: Problems) -> str:
-    """What the chat template says before the user does."""
+    """The chat template's text before the user's message."""
     where = "chat_template.jinja"
     if os.path.exists(checkpoint.path(where)):
         stated = read_text(checkpoint.path(where))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of BitVLA from config.json and the names of its tensors. An absent key means the default of the reference's own class, which
-stands beside the key.
+"""Sizes of BitVLA from config.json and the names of its tensors. An absent key has the default of the reference's own class,
+listed here with the key.
 
 Reference: BitVLA transformers (configuration_llava.py, configuration_bitnet.py, configuration_siglip.py, modeling_siglip.py),
 openvla-oft/prismatic/models (action_heads.py, projectors.py).
@@ -35,7 +35,7 @@ from .. import Dropped, oft
 
 WHERE = "config.json"
 VISION = defaults(768, 3072, 12, 12, image_size=224, patch_size=16, layer_norm_eps=1e-6, vision_use_head=True)
-# Towers of other numbers are plain ones: to the reference, an absent key means 32 bits.
+# Towers with another number of bits have no ternary weights: for the reference, an absent key means 32 bits.
 VISION_FIXED: Fixed = {
     "model_type": ("siglip_vision_model", "siglip_vision_model"),
     "num_channels": (3, 3),
@@ -57,7 +57,7 @@ TOP_FIXED: Fixed = {
     "projector_hidden_act": ("gelu", "gelu"),
     "multimodal_projector_bias": (True, True),
 }
-# Keys of transformers, of training, and those that no forward pass reads: the language model's activation is a literal.
+# Keys of transformers, of training, and keys that no forward pass reads: the language model's activation is fixed in the code.
 IGNORED = set(
     """
     _name_or_path architectures auto_map model_type image_seq_length image_token_index n_action_bins norm_stats text_config torch_dtype
@@ -71,7 +71,7 @@ IGNORED = set(
 class Sizes:
     vision: Vision = field(default_factory=Vision)
     lm: Language = field(default_factory=Language)
-    n_stored_layer: int = 0  # of the tower, whose first ones are read
+    n_stored_layer: int = 0  # stored layers of the tower; only the first vision.n_layer are used
     n_context: int = 0
     d_state: int = 0
     d_action: int = 0
@@ -91,7 +91,7 @@ def read_sizes(config: dict, problems: Problems) -> Sizes:
     if not isinstance(layer, int) or isinstance(layer, bool) or not -n <= layer <= n or layer == 0:
         top.bad("vision_feature_layer", "the number of a layer's output, -{0} to {0} and not 0".format(n))
         layer = -1
-    s.vision.n_layer = layer if layer > 0 else n + 1 + layer  # 0 is what enters the first layer
+    s.vision.n_layer = layer if layer > 0 else n + 1 + layer  # index 0 is the input of the first layer
     return s
 
 
@@ -155,7 +155,7 @@ def _vision(v: Vision) -> Rows:
 
 
 def dropped(s: Sizes) -> List[Dropped]:
-    """What the policy never reads: everything behind the tower's layer, and the language head."""
+    """Tensors that the policy never reads: those after the tower's last used layer, and the language head."""
     v, unread = s.vision, "features are read in front of it"
     stored = _vision(replace(v, n_layer=s.n_stored_layer))[len(_vision(v)) :]
     rows = [Dropped(row.source, row.stored, unread) for row in stored] + pooling_head(TOWER, v, unread)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Diffusion Policy: what its checkpoint states, as keys and tensors of a bundle.
+"""Converts checkpoints of Diffusion Policy to keys and tensors of a bundle.
 
 Reference: lerobot src/lerobot/policies/diffusion (configuration_diffusion.py, modeling_diffusion.py, processor_diffusion.py),
 torchvision models/resnet.py, and the schedulers of diffusers.
@@ -43,7 +43,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def moments(s: Sizes, name: str) -> List[str]:
-    """What a feature is called at each moment, the oldest first."""
+    """The feature's names at each moment, oldest first."""
     return ["{}@-{}".format(name, k) for k in range(s.n_moment - 1, 0, -1)] + [name]
 
 
@@ -55,7 +55,7 @@ def view_keys(s: Sizes, aliases: Sequence[str]) -> List[Key]:
 
 
 def state_keys(s: Sizes, info_path: str, notes: List[str], problems: Problems) -> List[Key]:
-    """Features by moment; their numbers are called as in the data set, which has one moment."""
+    """Keys of the state features at each moment; their numbers have the names of the data set, which has one moment."""
     widths = {recipe.STATE: s.d_state, **({ENVIRONMENT: s.d_environment} if s.d_environment else {})}
     keys = {key.name: key for key in feature_keys(info_path, {**widths, recipe.ACTION: s.d_action}, notes, problems)}
     named, first, names = keys["observation.state_names"], 0, []
@@ -70,7 +70,8 @@ def state_keys(s: Sizes, info_path: str, notes: List[str], problems: Problems) -
 
 
 def recipe_document(s: Sizes, processors: recipe.Processors, problems: Problems) -> Dict[str, List[dict]]:
-    """The reference normalizes pixels before it resizes and crops them, which gives the same: weights of a resize add up to 1."""
+    """The recipe. The reference normalizes pixels before it resizes and crops them; the result is the same, since the weights of a resize sum
+    to 1."""
     normalized = [(recipe.STATE, processors.state)] + ([(ENVIRONMENT, processors.others[ENVIRONMENT])] if s.d_environment else [])
     views = [(camera, processors.others[camera]) for camera in s.cameras for _ in range(s.n_moment)]
     rows = {"op": "rows", "first": s.n_moment - 1, "count": s.n_action_steps}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of a Diffusion Policy from its config.json, and everything in it that the runtime cannot honour.
+"""Sizes of a Diffusion Policy from its config.json, with refusals of everything that the runtime does not support.
 
-An absent key means the default of the reference's own class, which is stated here beside the key.
+An absent key has the default of the reference's own class, listed here with the key.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ...section import Section
 from .. import Options
 from ..act.config import BACKBONES, ENVIRONMENT, MAX_SIDE, cameras_of
 
-# DiffusionConfig's keys that numbers depend on, with the defaults of the class.
+# DiffusionConfig keys with effect on numbers, with the class's defaults.
 POLICY = {
     "n_obs_steps": 2,
     "horizon": 64,
@@ -46,7 +46,7 @@ POLICY = {
     "clip_sample_range": 1.0,
     "num_inference_steps": None,
 }
-# Keys that no number of an action chunk depends on, beside those of every policy of LeRobot. A crop is random in training alone.
+# Keys without effect on the numbers of an action chunk, beside those of every LeRobot policy. A crop is random only in training.
 IGNORED = set("crop_is_random drop_n_last_frames gradient_checkpointing do_mask_loss_for_padding scheduler_name".split())
 SCHEDULERS = {"DDPM": "ddpm", "DDIM": "ddim"}
 PREDICTIONS = {"epsilon": "noise", "sample": "sample"}
@@ -59,10 +59,10 @@ class Sizes:
     cameras: Sequence[str]
     frame: Tuple[int, int]  # width, height of a camera's frames
     resized: Optional[Tuple[int, int]]
-    image: Tuple[int, int]  # of what the network sees
+    image: Tuple[int, int]  # width, height of the network's images
     n_moment: int
-    d_state: int  # of one moment
-    d_environment: int  # 0: there is none
+    d_state: int  # width of the state at one moment
+    d_environment: int  # width of the environment's state; 0: none
     d_action: int
     horizon: int
     n_action_steps: int
@@ -86,7 +86,7 @@ class Sizes:
 
     @property
     def encoders(self) -> Sequence[Tuple[str, str]]:
-        """Of each encoder the bundle's path and the checkpoint's; none without cameras."""
+        """The bundle's and the checkpoint's prefix of each image encoder; empty without cameras."""
         at = ["{}.".format(i) for i in range(len(self.cameras))] if self.separate or not self.cameras else [""]
         return [("vision." + i, "diffusion.rgb_encoder." + i) for i in at]
 
@@ -159,7 +159,7 @@ def _check_words(policy: Section) -> None:
         policy.bad("pretrained_backbone_weights", "null, as use_group_norm is true", hint="the reference refuses it too")
     if not isinstance(policy.get("normalization_mapping"), dict):
         policy.bad("normalization_mapping", "the modes of VISUAL, STATE and ACTION")
-    policy.values.setdefault("normalization_mapping", POLICY["normalization_mapping"])  # for those who read it of the older layout
+    policy.values.setdefault("normalization_mapping", POLICY["normalization_mapping"])  # readers of the older layout use it
 
 
 def _check_together(policy: Section, s: Sizes) -> None:
@@ -205,7 +205,7 @@ def _read_widths(policy: Section) -> Tuple[int, ...]:
 
 
 def _pair(policy: Section, key: str) -> Optional[Tuple[int, int]]:
-    """Width and height of a size that the config states as height and width."""
+    """(width, height) of a size that the config states as [height, width]; None if it is null."""
     size = policy.get(key)
     if size is None:
         return None
@@ -216,7 +216,7 @@ def _pair(policy: Section, key: str) -> Optional[Tuple[int, int]]:
 
 
 def _image_sizes(policy: Section, frame: Tuple[int, int]) -> Tuple[Optional[Tuple[int, int]], Tuple[int, int]]:
-    """The size that frames are resized to, and that of the crop behind it, as the class computes it from the ratio."""
+    """(width, height) to which frames are resized, if they are, and of the crop after it, computed from the ratio as in the class."""
     resized, crop, ratio = _pair(policy, "resize_shape"), _pair(policy, "crop_shape"), policy.number("crop_ratio")
     if ratio > 1:
         policy.bad("crop_ratio", "a number in (0, 1]")
@@ -233,7 +233,7 @@ def _image_sizes(policy: Section, frame: Tuple[int, int]) -> Tuple[Optional[Tupl
 
 
 def _read_cameras(policy: Section) -> Tuple[Sequence[str], Tuple[int, int]]:
-    """Cameras in their order, and the size of their frames."""
+    """Cameras in order, and (width, height) of their frames."""
     features = policy.get("input_features")
     cameras, sizes = cameras_of(policy)
     if not cameras and not (isinstance(features, dict) and ENVIRONMENT in features):

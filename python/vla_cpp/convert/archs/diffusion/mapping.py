@@ -14,7 +14,7 @@ from ..act.mapping import WIDTHS, resnet_convolutions
 from .config import Sizes
 
 UNET = "diffusion.unet."
-GROUP = 16  # features of a group where batch norms are replaced
+GROUP = 16  # features per group of the group norms that replace batch norms
 
 
 def network_keys(s: Sizes) -> List[Key]:
@@ -51,13 +51,13 @@ def encoder(s: Sizes, target: str, source: str) -> Rows:
     ]
 
 
-# torchvision's modules by their place, since the reference keeps all but the last two of a ResNet in a row.
+# torchvision's modules -> their index: the reference keeps all but the last two modules of a ResNet in a Sequential.
 SEQUENTIAL = {"conv1": "0", "bn1": "1", "layer1": "4", "layer2": "5", "layer3": "6", "layer4": "7"}
 NORMS = {"stem": "stem_norm", "conv1": "norm1", "conv2": "norm2", "shortcut": "shortcut_norm"}
 
 
 def convolution(s: Sizes, target: str, source: str, behind: str, d_out: int, d_in: int, size: int) -> Rows:
-    """With the frozen batch norm behind it as part of matrix and bias, or beside a norm of groups."""
+    """A convolution and the norm after it: a frozen batch norm is folded into matrix and bias; a group norm has its own tensors."""
     stored, shape = (d_out, d_in, size, size), (d_out, size * size * d_in)
     if not s.group_norm:
         return [
@@ -70,7 +70,7 @@ def convolution(s: Sizes, target: str, source: str, behind: str, d_out: int, d_i
 
 
 def unet(s: Sizes) -> Rows:
-    """Blocks in the order in which they run: two of each level downwards, two at the bottom, two of each level upwards."""
+    """Blocks in order of execution: two per level downwards, two at the bottom, two per level upwards."""
     n, widths = len(s.widths), (s.d_action, *s.widths)
     blocks = [("down_modules.{}.{{}}".format(i), widths[i], widths[i + 1]) for i in range(n)]
     blocks += [("mid_modules.{}", widths[n], widths[n])]
@@ -96,7 +96,7 @@ def block(s: Sizes, target: str, source: str, d_in: int, d_out: int) -> Rows:
     for i, d in ((1, d_in), (2, d_out)):
         rows += token_convolution("{}conv{}".format(target, i), "{}conv{}.block.0".format(source, i), d_out, d, s.kernel_size)
         rows += norm("{}norm{}".format(target, i), "{}conv{}.block.1".format(source, i), d_out)
-    # The condition is the time's embedding, then the observation.
+    # The condition is the embedding of the time, followed by the observation.
     d_film, d_all = (2 if s.scales else 1) * d_out, s.d_time + s.d_observation
     for name, columns in (("film_time", range(s.d_time)), ("film_observation", range(s.d_time, d_all))):
         shape = (d_film, len(columns))
@@ -115,8 +115,9 @@ def token_convolution(target: str, source: str, d_out: int, d_in: int, size: int
 
 
 def doubling(target: str, source: str, d: int) -> Rows:
-    """A transposed convolution of four places, stored as (in, out, place): tokens at even places are made of the one before by the last
-    place and of their own by the second, those at odd places of their own by the third and of the next by the first."""
+    """A transposed convolution with kernel size 4, stored as (in, out, kernel position). It doubles the number of tokens: an output at an even
+    position is the previous input times kernel position 3 plus its own input times position 1; at an odd position it is its own input times
+    position 2 plus the next input times position 0."""
     rows: Rows = []
     for name, places in (("even", (3, 1)), ("odd", (2, 0))):
         rows.append(Weight(target + name + ".weight", source + ".weight", MATRIX, (d, d, 4), (d, 2 * d), pick=(2, places), axes=(1, 2, 0)))
@@ -125,7 +126,7 @@ def doubling(target: str, source: str, d: int) -> Rows:
 
 
 def dropped(s: Sizes) -> List[Dropped]:
-    """Counters of batch norms, which only training reads."""
+    """Counters in batch norms, which only training reads."""
     if s.group_norm:
         return []
     reason = "how many batches a norm has seen matters in training alone"

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Evo-1: InternVL3 as the prefix, a flow-matching head that reads the whole prompt by cross-attention.
+"""Evo-1: InternVL3 as the prefix, and a flow-matching head that reads the whole prompt by cross-attention.
 
-Two layouts, the authors' and LeRobot's, are in layouts.py; keys and tensors in mapping.py.
+layouts.py reads the authors' and LeRobot's layout; mapping.py has keys and tensors.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     problems.raise_any()
     sizes = source.sizes
     tokenizer = read_tokenizer(source.tokenizer, sizes.lm.n_vocab, problems, checkpoint.notes)
-    problems.raise_any()  # a prompt takes a sound tokenizer
+    problems.raise_any()  # the prompt needs a valid tokenizer
     prompt = _prompt(source, tokenizer, problems)
     document = {
         "image": source.image,
@@ -59,8 +59,8 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def _prompt(source: Source, tokenizer: TokenizerPlan, problems: Problems) -> Prompt:
-    """The slots in the prompt, after checking that the tokenizer cuts, and where there are pads fills, behind them. LeRobot fills up
-    to the longest prompt of a batch, which for one is none."""
+    """The positions of the views in the prompt. Checks that the tokenizer truncates on the right, after the views, and also pads there if the
+    network sees pads. LeRobot pads to the longest prompt of a batch, so a single prompt has no pads."""
     s, where = source.sizes, "tokenizer_config.json"
     config = with_defaults(read_json(os.path.join(source.tokenizer, where)))
     sides = {"truncation_side": tokenizer.truncate}
@@ -80,7 +80,7 @@ def _prompt(source: Source, tokenizer: TokenizerPlan, problems: Problems) -> Pro
     return prompt
 
 
-# --- the front of a prompt, which no instruction changes: where its image tokens stand -------------------------------------------------
+# --- the positions of image tokens at the beginning of a prompt, independent of the instruction -----------------------------------------
 
 IMAGE, OPEN, CLOSE = "<IMG_CONTEXT>", "<img>", "</img>"
 OP = {"op": "views", "open": "Image-{i}: " + OPEN, "token": IMAGE, "close": CLOSE + "\n"}
@@ -94,7 +94,7 @@ class Prompt(NamedTuple):
 
 
 def view_op(max_views: int, n_token: int) -> dict:
-    """`n_token`: image tokens of a view."""
+    """The recipe's op for the views. `n_token`: image tokens per view."""
     return {"op": "views", "count": max_views, **{k: OP[k] for k in ("open", "token")}, "repeat": n_token, "close": OP["close"]}
 
 

@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The two layouts of Evo-1.
 
-Evo-1 as its authors save it: config.json, norm_stats.json, weights in a torch file. The code that served a checkpoint is part of its
-meaning, and the checkpoint does not name it: what it leaves open is asked for, all of it at once.
+The authors' layout: config.json, norm_stats.json, weights in a torch file. The meaning of a checkpoint depends on the code that served it,
+which the checkpoint does not name; options state what is missing, and all missing options are reported together.
 
-Reference: MINT-SJTU/Evo-1, Evo_1/scripts/{Evo1_server,Evo1,train}.py, Evo_1/config.py, Evo_1/model. An absent key means the default of
-its EvoConfig, which is stated here beside the key.
+Reference: MINT-SJTU/Evo-1, Evo_1/scripts/{Evo1_server,Evo1,train}.py, Evo_1/config.py, Evo_1/model. An absent key has the default of
+the reference's EvoConfig, listed here with the key.
 
-Evo-1 as LeRobot saves it: config.json and the two processor pipelines.
+LeRobot's layout: config.json and the two processor pipelines.
 
-Reference: lerobot src/lerobot/policies/evo1 (configuration, processor, modeling, internvl3_embedder). An absent key means the
-default of Evo1Config, which is stated here beside the key.
+Reference: lerobot src/lerobot/policies/evo1 (configuration, processor, modeling, internvl3_embedder). An absent key has the
+default of Evo1Config, listed here with the key.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from .mapping import AUTHORS, LEROBOT, Sizes, Spelling, check_head, read_chat_ba
 class Source:
     sizes: Sizes
     names: Spelling
-    tokenizer: str  # its folder
-    image_token: object  # the id that the backbone's config states, None where it states none
+    tokenizer: str  # folder of the tokenizer
+    image_token: object  # the image token's id in the backbone's config; None if it states none
     image: List[dict]
     state: List[dict]
     action: List[dict]
@@ -53,7 +53,7 @@ class Source:
 
 
 def image_ops(side: int, filter_name: str, arithmetic: str) -> List[dict]:
-    """The statistics are literals of both references."""
+    """The recipe's image ops. Both references contain the statistics as literals."""
     return [
         {"op": "resize", "width": side, "height": side, "filter": filter_name},
         {"op": "standardize", **IMAGENET, "arithmetic": arithmetic},
@@ -66,7 +66,7 @@ def pad_op(size: int, value: float) -> dict:
 
 # --- the authors' layout ---------------------------------------------------------------------------------------------------------------
 
-# What the trainer writes, with and without DeepSpeed, and the member that holds the policy's tensors.
+# Files of the trainer, with and without DeepSpeed -> the member with the policy's tensors.
 TORCH_FILES = {"mp_rank_00_model_states.pt": "module", "checkpoint.pt": "model_state_dict"}
 NORM_STATS = "norm_stats.json"
 
@@ -100,10 +100,10 @@ code since (steps, time index, pixel rounding and state padding differ); --maske
 flash-attn, which the authors ask for. docs/converting.md tells how to find out.""",
 )
 
-WIDTH = 24  # of states and actions on their way to the network: a literal of the server
+WIDTH = 24  # padded width of states and actions, a literal of the server
 EPS = 1e-8
 MAX_SLOTS = 32
-DIMS_FILE, DIMS = "dims.json", {"language_layers": 14, "prompt_tokens": 1024}  # literals of the embedder
+DIMS_FILE, DIMS = "dims.json", {"language_layers": 14, "prompt_tokens": 1024}  # defaults are literals of the embedder
 DOCS = "docs/converting.md, Evo-1"
 MEANINGS = {
     "--variant": "the authors' code before 9 April 2026 takes other steps, times, pixels and paddings than the code since, and a policy"
@@ -117,12 +117,12 @@ MEANINGS = {
 
 
 class Revision(NamedTuple):
-    """What the server of one revision does, whatever config.json says."""
+    """Settings that are fixed in one revision of the server, whatever config.json says."""
 
     n_step: int
     time_scale: float
     arithmetic: str
-    pad: float  # the number in state columns that the robot does not have
+    pad: float  # value of padded state columns
 
 
 REVISIONS = {"r1": Revision(32, 1000.0, "float32_then_bfloat16", -1.0), "r2": Revision(50, 999.0, "bfloat16", 0.0)}
@@ -144,7 +144,7 @@ AUTHORS_FIXED = {
     "return_cls_only": (False, False),
     "action_head": ("flowmatching", "flowmatching"),
 }
-# Keys of training and of logging, of either revision. The server counts its own steps and resizes to the embedder's own size.
+# Keys of training and logging in either revision. The server has its own number of steps and resizes to the embedder's size.
 AUTHORS_IGNORED = set(
     """
     device run_name disable_wandb wandb_project debug dataset_type data_paths dataset_config_path image_size binarize_gripper
@@ -154,7 +154,7 @@ AUTHORS_IGNORED = set(
     finetune_vlm finetune_language_model finetune_vision_model finetune_action_head dropout num_inference_timesteps action_dim
     """.split()
 )
-# normalization_type -> the recipe's kind, the statistics that it reads, and whether a state is held in [-1, 1]
+# normalization_type -> the recipe's kind, the statistics that it reads, and whether a state is clipped to [-1, 1]
 KINDS = {
     "bounds": ("evo1_min_max", ("min", "max"), True),
     "bounds_q99": ("evo1_quantiles", ("q01", "q99"), True),
@@ -210,7 +210,7 @@ def _check_answers(options: Options, problems: Problems) -> None:
 
 
 def _find_statistics(checkpoint: Checkpoint, options: Options, problems: Problems) -> dict:
-    """One entry of norm_stats.json: under an arm and a data set, or under the arm alone, as older files have it."""
+    """One entry of norm_stats.json, stored by arm and data set, or in older files by arm alone."""
     entries: Dict[str, dict] = {}
     for arm, value in read_json(checkpoint.path(NORM_STATS)).items():
         inner = value if isinstance(value, dict) else {}
@@ -253,7 +253,7 @@ def _authors_sizes(policy: Section, checkpoint: Checkpoint, options: Options) ->
 
 
 def _dims(checkpoint: Checkpoint, problems: Problems) -> Section:
-    """Two literals of the embedder, for checkpoints of other sizes than the published."""
+    """The sizes in dims.json, which replace two literals of the embedder for checkpoints of unpublished sizes."""
     path = checkpoint.path(DIMS_FILE)
     dims = Section(DIMS_FILE, read_json(path) if os.path.exists(path) else {}, DIMS, problems)
     for key in sorted(set(dims.values) - set(DIMS)):
@@ -277,7 +277,7 @@ class _Normalized(NamedTuple):
 
 
 def _normalization(feature: str, op: str, name: str, stats: dict, checkpoint: Checkpoint, problems: Problems) -> Tuple[_Normalized, bool]:
-    """The op with its statistics, and whether it is followed by a clip."""
+    """The op with its statistics, and whether a clip follows."""
     kind, names, clip = KINDS[name]
     stated = stats.get(feature) if isinstance(stats.get(feature), dict) else {}
     if name == "bounds_q99" and any(stated.get(n) is None for n in names):
@@ -297,7 +297,7 @@ def _numbers(where: str, values, name: str, problems: Problems) -> np.ndarray:
         found = "none" if values is None else "{} numbers".format(len(values)) if numbers else str(type(values).__name__)
         problems.add(where, "1 to {} numbers".format(WIDTH), found)
         return np.zeros(1, np.float32)
-    with np.errstate(over="ignore"):  # told below
+    with np.errstate(over="ignore"):  # reported below
         chosen = np.asarray(values, np.float64).astype(np.float32)
     if not np.isfinite(chosen).all():
         problems.add(where, "finite numbers", str(chosen[~np.isfinite(chosen)][0]))
@@ -311,9 +311,10 @@ def _width(statistics: Dict[str, np.ndarray]) -> int:
 
 
 def _authors_features(checkpoint: Checkpoint, options: Options, s: Sizes, problems: Problems) -> List[Key]:
-    """Every view may stay away: its slot is masked, as a client of the reference masks the images that it does not have."""
+    """Keys of views, states and actions. Any view may be declared absent: its slot is masked, as a client of the reference masks missing
+    images."""
     names = [view_name(name) for name in options.views]
-    # The server gets an image for every slot, and the client says which of them are none: nothing is absent by silence.
+    # The reference's client sends an image and a mask for every slot, so an absent view must be declared.
     views = views_of(names, [""] * len(names), [0] * len(names))
     return robot_keys(views, {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}, options.dataset_info, checkpoint.notes, problems)
 
@@ -348,7 +349,7 @@ GRIPPER = {
     "gripper_above_threshold_value": -1.0,
 }
 LEROBOT_FIXED = {"action_head": ("flowmatching", "flowmatching"), "num_categories": (1, 1), "return_cls_only": (False, False)}
-# Keys that no number of an action chunk depends on.
+# Keys without effect on the numbers of an action chunk.
 LEROBOT_IGNORED = set(
     """
     training_stage use_flash_attn dropout enable_gradient_checkpointing gradient_checkpointing_use_reentrant finetune_vlm
@@ -360,11 +361,11 @@ PAD_STATE, ACTION_STEP = "evo1_pad_state_processor", "evo1_action_processor"
 STEPS: recipe.Steps = {
     recipe.PRE: {
         PAD_STATE: {"max_state_dim": recipe.ANY},
-        "evo1_pad_action_processor": {"max_action_dim": recipe.ANY},  # of training
+        "evo1_pad_action_processor": {"max_action_dim": recipe.ANY},  # only training uses it
     },
     recipe.POST: {ACTION_STEP: {key: recipe.ANY for key in ("action_dim", *GRIPPER)}},
 }
-# What the reference fills statistics with up to the padded width (_STAT_PAD_VALUES).
+# Values with which the reference pads statistics to the padded width (_STAT_PAD_VALUES).
 NEUTRAL = {"mean": 0.0, "std": 1.0, "min": -1.0, "max": 1.0, "q01": -1.0, "q99": 1.0, "q10": -1.0, "q90": 1.0}
 
 
@@ -412,7 +413,7 @@ def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -
 
 
 def _lerobot_sizes(policy: Section) -> Sizes:
-    """A state or an action that the config does not list has the padded width (Evo1Config.validate_features)."""
+    """The sizes in the config. A state or action that it does not list has the padded width (Evo1Config.validate_features)."""
     s = Sizes(
         n_layer=policy.count("vlm_num_layers", maximum=MAX_LAYERS) if policy.get("vlm_num_layers") is not None else MAX_LAYERS,
         n_token=policy.count("max_text_length"),
@@ -467,7 +468,7 @@ def _read_pipelines(policy: Section, checkpoint: Checkpoint, options: Options, s
     if ACTION_STEP in order:
         if order.index(ACTION_STEP) < order.index("unnormalizer_processor"):
             problems.unsupported(recipe.POST, ACTION_STEP + " after un-normalization", "the opposite order")
-        # The reference builds this step again from config.json; a file that says otherwise contradicts it.
+        # The reference rebuilds this step from config.json, so the pipeline's file must agree with it.
         stated = {"action_dim": s.action_dim, **{key: policy.get(key) for key in GRIPPER}}
         for key, value in configs[ACTION_STEP].items():
             if value != stated[key]:
@@ -476,8 +477,8 @@ def _read_pipelines(policy: Section, checkpoint: Checkpoint, options: Options, s
 
 
 def _pad_value(norm: Normalization, s: Sizes, problems: Problems) -> float:
-    """What the reference's order makes of padded columns: zeros are appended to the state first, and normalized with the rest, by
-    neutral statistics unless the file has others for those columns."""
+    """The normalized value of padded state columns. The reference first appends zeros to the state and then normalizes all columns; padded
+    columns have neutral statistics unless the file has others for them."""
     padded: Dict[str, np.ndarray] = {}
     for name, value in norm.statistics.items():
         fill = np.full(s.d_state - value.size, NEUTRAL[name], np.float32)
@@ -496,13 +497,13 @@ def _pad_value(norm: Normalization, s: Sizes, problems: Problems) -> float:
 
 
 def _normalized_zero(norm: Normalization, stats: Dict[str, np.ndarray]) -> np.ndarray:
-    """The formulas of normalize_processor.py at 0, in float32."""
+    """The values of normalize_processor.py's formulas at 0, in float32."""
     if not stats:
         return np.zeros(0, np.float32)
     eps = np.float32(norm.eps)
     if norm.kind == "mean_std":
         return (np.float32(0) - stats["mean"]) / (stats["std"] + eps)
-    low, high = stats.values()  # in the order in which MODES names them
+    low, high = stats.values()  # in the order of MODES
     span = high - low
     return np.float32(2) * (np.float32(0) - low) / np.where(span == 0, eps, span) - np.float32(1)
 
@@ -522,6 +523,6 @@ def _gripper(policy: Section, width: int) -> List[dict]:
 
 
 def _view_keys(views: List[str], n_empty: int, processors: recipe.Processors, checkpoint: Checkpoint, problems: Problems) -> List[Key]:
-    """The reference takes an unmentioned camera as absent, of any name, but no more of them than `empty_cameras`."""
+    """Keys of the views. As in the reference, up to `empty_cameras` cameras, of any names, may be left out and are then absent."""
     aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
     return [*views_of(views, aliases, [1] * len(views), max(1, len(views) - n_empty)), *run_keys(checkpoint, views)]

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of an Evo-1 policy: what both layouts share, as keys and tensors of a bundle. The towers stand in the backbone's config.json, in two spellings: `internvl_chat`
-(OpenGVLab/InternVL3-1B, remote code) and `internvl` (OpenGVLab/InternVL3-1B-hf, transformers).
+"""The common part of Evo-1's two layouts: sizes, keys and tensors of a bundle. The backbone's config.json describes the towers, in one of two
+forms: `internvl_chat` (OpenGVLab/InternVL3-1B, remote code) and `internvl` (OpenGVLab/InternVL3-1B-hf, transformers).
 
-An absent key means the default of the reference's own class, which is stated here beside the key. Keys that the class does not read
-stay without effect there too.
+An absent key has the default of the reference's own class, listed here with the key. Keys that the class does not read
+have no effect in the reference either.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ...networks import NORM_EPS, Language, Vision, check_heads, decoder, defaul
 from ...section import Fixed, Section
 
 WHERE = "backbone config.json"
-N_TIME = 1000  # rows of the time table, a literal of the reference
+N_TIME = 1000  # rows of the table of times, a literal of the reference
 
-# InternVisionConfig and InternVLChatConfig of the InternVL repository; Qwen2Config of transformers.
+# Defaults of InternVisionConfig and InternVLChatConfig (InternVL repository) and of Qwen2Config (transformers).
 CHAT_VISION = defaults(3200, 12800, 48, 25, image_size=224, patch_size=14, layer_norm_eps=1e-6)
 CHAT_VISION_FIXED: Fixed = {
     "hidden_act": ("gelu", "gelu"),
@@ -38,7 +38,7 @@ CHAT_FIXED: Fixed = {
     "use_backbone_lora": (0, 0),
     "use_llm_lora": (0, 0),
 }
-# InternVLVisionConfig and InternVLConfig of transformers.
+# Defaults of transformers' InternVLVisionConfig and InternVLConfig.
 HF_VISION = defaults(1024, 4096, 24, 16, image_size=[448, 448], patch_size=[14, 14], layer_norm_eps=1e-6)
 HF_VISION_FIXED: Fixed = {
     "hidden_act": ("gelu", "gelu"),
@@ -67,7 +67,7 @@ TEXT_FIXED: Fixed = {"model_type": ("qwen2", "qwen2"), "hidden_act": ("silu", "s
 class Sizes:
     vision: Vision = field(default_factory=Vision)
     lm: Language = field(default_factory=Language)
-    n_layer: int = 0  # of the backbone's, which the policy keeps
+    n_layer: int = 0  # layers of the backbone that the policy keeps
     n_head_layer: int = 0
     n_head_head: int = 0
     d_hidden: int = 0
@@ -75,7 +75,7 @@ class Sizes:
     d_state: int = 0
     d_action: int = 0
     state_dim: int = 0
-    action_dim: int = 0  # numbers of an action that the robot is sent
+    action_dim: int = 0  # numbers of an action that the robot gets
     d_robot: int = 0
     horizon: int = 0
     max_views: int = 0
@@ -91,7 +91,7 @@ class Sizes:
 
 
 def read_chat_backbone(config: dict, s: Sizes, problems: Problems) -> None:
-    """`internvl_chat`."""
+    """Reads a config of the form `internvl_chat`."""
     chat = Section(WHERE, config, {}, problems)
     chat.check_fixed(CHAT_FIXED, "--backbone needs the folder of OpenGVLab/InternVL3-1B")
     vision = Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), CHAT_VISION, problems)
@@ -107,7 +107,7 @@ def read_chat_backbone(config: dict, s: Sizes, problems: Problems) -> None:
 
 
 def read_hf_backbone(config: dict, s: Sizes, problems: Problems) -> None:
-    """`internvl`."""
+    """Reads a config of the form `internvl`."""
     whole = Section(WHERE, config, {"image_seq_length": 256}, problems)
     whole.check_fixed(HF_FIXED, "--backbone needs the folder of OpenGVLab/InternVL3-1B-hf")
     vision = Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), HF_VISION, problems)
@@ -124,7 +124,7 @@ def _text_section(config: dict, key: str, problems: Problems) -> Section:
 
 
 def _side(section: Section, key: str) -> int:
-    """A number, or a square's [height, width]."""
+    """A side, stated as a number or as [height, width] of a square."""
     value = section.get(key)
     if isinstance(value, list) and len(value) == 2 and value[0] == value[1]:
         value = value[0]
@@ -138,7 +138,7 @@ def _read_vision(vision: Section, image_size: int, patch_size: int, s: Sizes) ->
 
 
 def _read_text(text: Section, s: Sizes) -> None:
-    """`s.n_layer`: how many of the layers the policy keeps."""
+    """Reads the language model's config. `s.n_layer`: number of layers that the policy keeps."""
     text.check_fixed(TEXT_FIXED)
     s.lm = lm = read_language(text)
     lm.n_layer, d_head = min(s.n_layer, lm.n_layer), lm.d_model // lm.n_head
@@ -165,7 +165,7 @@ def _rope(text: Section, s: Sizes) -> float:
 
 
 def check_head(policy: Section, s: Sizes, embed_dim: int) -> None:
-    """What the head must share with the towers, and the shapes of it that the runtime does not have."""
+    """Checks that the head fits the towers, and refuses shapes of the head that the runtime does not support."""
     if embed_dim != s.lm.d_model:
         policy.bad("embed_dim", "the language model's width {}".format(s.lm.d_model))
     if s.lm.d_model % s.n_head_head:
@@ -192,7 +192,7 @@ def network_keys(s: Sizes) -> List[Key]:
 
 
 class Spelling(NamedTuple):
-    """Names of either; the first three below `vision`, those of the connector below `connector`."""
+    """Tensor names of one layout. class_token, position and patch follow the prefix `vision`; the connector's names follow `connector`."""
 
     vision: str
     class_token: str
@@ -252,7 +252,7 @@ def weights(s: Sizes, names: Spelling) -> Rows:
 
 
 def _waves(target: str, source: str, n_row: int, d: int) -> Rows:
-    """Sines and cosines, which are no parameters: stored in float32 they stay so, whatever the matrices are."""
+    """A table of sines and cosines, which are not parameters: if stored in float32 it stays in float32, whatever the matrices' type."""
     return table(target, source, n_row, d, (1, n_row, d), keep_f32=True)
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The backbones of GR00T N1.5 and N1.6, Eagle 2.5 and Eagle 3: a tower of the SigLIP family, a connector, the first layers of Qwen3.
 
-Their configs, tokenizers and processors lie in the authors' code tree and not beside the weights.
+Their configs, tokenizers and processors are in the authors' source tree, not beside the weights.
 References: Isaac-GR00T gr00t/model/backbone/eagle2_hg_model (N1.5), gr00t/model/modules/nvidia/Eagle-Block2A-2B-v2 (N1.6).
 """
 
@@ -29,7 +29,7 @@ from .sizes import WHERE, Sizes
 IMAGE = "<IMG_CONTEXT>"
 SYSTEM = START + "system\nYou are a helpful assistant." + END + "\n" + START + "user\n"
 OPEN, CLOSE = "<image {i}><img>", "</img>"
-# SiglipVisionConfig, Siglip2VisionConfig and Qwen3Config of transformers.
+# Defaults of transformers' SiglipVisionConfig, Siglip2VisionConfig and Qwen3Config.
 VISION = defaults(768, 3072, 12, 12, image_size=224, num_patches=256, patch_size=16, layer_norm_eps=1e-6)
 VISION_FIXED: Fixed = {
     "hidden_act": ("gelu_pytorch_tanh", "gelu_pytorch_tanh"),
@@ -51,7 +51,7 @@ FILE = "preprocessor_config.json"
 
 
 class Eagle:
-    """One of the two. `root`: where its tensors stand, up to the dot. `merge`: patches on a side of a token."""
+    """One of the two backbones. `root`: prefix of its tensors, up to the dot. `merge`: patches per side of a token."""
 
     def __init__(self, model_type: str, root: str, merge: int, template: Template, folder: str) -> None:
         self.model_type, self.root, self.merge, self.TEMPLATE, self.folder = model_type, root, merge, template, folder
@@ -94,7 +94,7 @@ class Eagle:
             vision.bad("num_patches", "a square")
 
     def read_area(self, folder: str, s: Sizes, problems: Problems) -> Area:
-        """What smart_resize of its processor leaves alone, and what it makes of other sizes."""
+        """The image sizes that smart_resize of the processor keeps, and the rule for others."""
         path = os.path.join(folder, FILE)
         Section("backbone " + FILE, read_json(path), {}, problems).check_fixed(IMAGE_FIXED)
         side = self.merge * s.vision.patch_size
@@ -113,7 +113,7 @@ class Eagle:
         vision = self.root + "vision_model.vision_model."
         rows = siglip(vision, s.vision, s.n_position_side**2)
         if self.merge > 1:
-            # Patches are flattened pixel by pixel there, channel by channel here.
+            # The checkpoint flattens patches pixel by pixel, the bundle channel by channel.
             rows[0] = rows[0]._replace(stored=rows[0].shape, regroup=3)
         return [*rows, *self._connector(s), *decoder(s.lm, self.LM, QWEN3)]
 
@@ -121,7 +121,7 @@ class Eagle:
         source = self.root + "mlp1."
         if self.merge == 1:
             return linear("projector", source + "0", s.lm.d_model, s.vision.d_model)
-        # The patches of a square stand side by side for each feature there, the features of each patch here.
+        # For a square of patches, the checkpoint stores each feature's patches together, the bundle each patch's features.
         n_patch, d = self.merge**2, self.merge**2 * s.vision.d_model
         *regrouped, bias = norm("connector.norm", source + "0", d) + linear("connector.up", source + "1", s.lm.d_model, d)
         down = linear("connector.down", source + "3", s.lm.d_model, s.lm.d_model)

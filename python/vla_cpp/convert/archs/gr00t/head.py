@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The action head: its part of a policy's config, its tensors, and its keys.
 
-Self-attention over the features, where there is one; a diffusion transformer; encoders and a decoder with weights of their own for each
-robot. Reference: Isaac-GR00T gr00t/model/modules/dit.py, embodiment_conditioned_mlp.py.
+The head has optional self-attention over the features, a diffusion transformer, and encoders and a decoder with separate weights per robot.
+Reference: Isaac-GR00T gr00t/model/modules/dit.py, embodiment_conditioned_mlp.py.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .. import MATRIX, Weight
 from .sizes import Sizes
 
 HEAD = "action_head."
-# DiT and SelfAttentionTransformer of gr00t/model/modules/dit.py.
+# Defaults of DiT and SelfAttentionTransformer in gr00t/model/modules/dit.py.
 TRANSFORMER = {"num_attention_heads": 8, "attention_head_dim": 64, "num_layers": 12, "output_dim": 26}
 TRANSFORMER_FIXED: Fixed = {
     "attention_bias": (True, True),
@@ -34,7 +34,7 @@ DIT_FIXED: Fixed = {
     "interleave_self_attention": (False, True),
 }
 TRANSFORMER_IGNORED = {
-    "cross_attention_dim",  # checked by the shapes of keys and values
+    "cross_attention_dim",  # the shapes of keys and values check it
     "dropout",
     "final_dropout",
     "num_embeds_ada_norm",
@@ -44,7 +44,7 @@ TRANSFORMER_IGNORED = {
 
 
 def read(policy: Section, s: Sizes) -> None:
-    """`policy`: the members that describe the head; the language model's sizes are read already."""
+    """Reads the head's sizes; those of the language model must be set already. `policy`: the members that describe the head."""
     if "state_history_length" in policy.defaults:
         s.state_history = policy.count("state_history_length", maximum=64)
     s.d_state, s.horizon = policy.count("max_state_dim") * s.state_history, policy.count("action_horizon")
@@ -81,7 +81,7 @@ def _read_transformer(policy: Section, s: Sizes) -> None:
 
 
 def _read_attention(policy: Section, s: Sizes) -> None:
-    """Absent, or without layers, the features pass as they are."""
+    """Reads the self-attention over the features. If it is absent or has no layers, the features pass unchanged."""
     if not policy.get("vl_self_attention_cfg"):
         return
     attention = _transformer(policy, "vl_self_attention_cfg", TRANSFORMER_FIXED)
@@ -115,14 +115,14 @@ def transformer_rows(s: Sizes) -> Rows:
     rows = linear("time_in", time + "linear_1", d, s.d_time) + linear("time_out", time + "linear_2", d, d)
     for i in range(s.n_dit_layer):
         target, theirs = "dit.blk.{}.".format(i), "{}transformer_blocks.{}.".format(source, i)
-        # Even blocks read the features, odd ones themselves.
+        # Even blocks have cross-attention to the features, odd ones self-attention.
         rows += linear(target + "ada", theirs + "norm1.linear", 2 * d, d)
         rows += block(target, theirs, BLOCK, d, s.d_dit_ff, d if i % 2 else s.lm.d_model)
     return rows + linear("dit.out_ada", source + "proj_out_1", 2 * d, d) + linear("dit.out", source + "proj_out_2", s.d_out, d)
 
 
 def _of_robot(target: str, source: str, s: Sizes, d_out: int, d_in: int) -> Rows:
-    """The robot's part of a matrix that is stored for all of them, inputs before outputs."""
+    """The robot's layer in a tensor that stacks those of all robots, each matrix as (in, out)."""
     pick, n = (0, s.embodiment), s.n_embodiment
     matrix = Weight(target + ".weight", source + ".W", MATRIX, (n, d_in, d_out), (d_out, d_in), pick=pick, transpose=True)
     return [matrix, *vector(target + ".bias", source + ".b", d_out, (n, d_out), pick=pick)]
@@ -143,7 +143,7 @@ def _robot(s: Sizes) -> Rows:
 
 
 def keys(s: Sizes) -> Dict[str, Mapping[str, object]]:
-    """By module. Numbers that no config states are literals of the reference."""
+    """Key values by module. Numbers that no config states are literals of the reference."""
     dit = dict(d_model=s.d_dit, n_layer=s.n_dit_layer, n_head=s.n_dit_head, d_ff=s.d_dit_ff, **pick(s, "d_out d_time n_bucket d_hidden"))
     return {
         "policy": dict(d_state=s.d_state * s.n_state_row, **pick(s, "d_action horizon n_position max_views")),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images of GR00T N1.6 and N1.7: the pipeline of their processor, and the size that comes out.
+"""Images of GR00T N1.6 and N1.7: the processor's pipeline and the resulting size.
 
 Reference: Isaac-GR00T gr00t/model/gr00t_n1d7/image_augmentations.py, which lerobot policies/groot/processor_groot.py
 (_transform_n1_7_image_for_vlm_albumentations) equals.
@@ -16,7 +16,7 @@ from ...section import Section
 from .. import Options
 from .robot import DOCS, PROCESSOR
 
-# In bytes: the reference folds the rescaling by 1 / 255 into mean and std, which then are exact.
+# On bytes: the reference folds the rescaling by 1 / 255 into mean and std, which are then exact.
 STANDARDIZE = {"op": "standardize", "mean": [0.5] * 3, "std": [0.5] * 3, "arithmetic": "float32_in_bytes"}
 MAX_SIDE = 8192
 
@@ -28,18 +28,18 @@ class Images(NamedTuple):
 
 
 class Area(NamedTuple):
-    """The sides and areas of images that the backbone's image processor leaves alone."""
+    """The sides and areas of images that the backbone's image processor does not resize."""
 
-    file: str  # that states them
-    filter: str  # by which it resizes others
-    shortest: int  # side of an image
-    multiple: int
+    file: str  # the file that states them
+    filter: str  # filter for resizing other images
+    shortest: int  # smallest side of an image
+    multiple: int  # a side is a multiple of this
     min_pixels: int
     max_pixels: int
 
 
 def read_images(processor: Section, area: Area, options: Options, notes: List[str], problems: Problems) -> Images:
-    """`processor`: the members of processor_kwargs."""
+    """The image ops and the resulting size. `processor`: the members of processor_kwargs."""
     edge, fraction = _edge(processor), _fraction(processor)
     pad, camera_size = options.letterbox or processor.get("letter_box_transform") is True, options.camera_size
     width, height = _camera(camera_size, edge, pad)
@@ -52,7 +52,7 @@ def read_images(processor: Section, area: Area, options: Options, notes: List[st
         width, height = _smallest_side(max(1, int(width * fraction)), max(1, int(height * fraction)), edge)
     held = held_size(width, height, area, "--camera-size", problems)
     if held != (width, height):
-        if not pad:  # the aspect is seen before the resize hides it
+        if not pad:  # checks the aspect ratio, which the resize would hide
             ops.append({"op": "expect_size", "width": width, "height": height})
         ops.append({"op": "resize", "width": held[0], "height": held[1], "filter": area.filter})
     width, height = held
@@ -67,7 +67,7 @@ def read_images(processor: Section, area: Area, options: Options, notes: List[st
 
 
 def read_square_images(processor: Section, area: Area, options: Options, notes: List[str], problems: Problems) -> Images:
-    """LeRobot's pipeline without albumentations: frames of any aspect become squares, which are cropped and enlarged again."""
+    """LeRobot's pipeline without albumentations: frames of any aspect ratio become squares, which are cropped and enlarged again."""
     if options.camera_size:
         raise refuse("--camera-size", "no such option", options.camera_size, "frames of any size become squares of this policy", Code.USAGE)
     target, edge = _pair(processor, "image_target_size"), _edge(processor)
@@ -75,7 +75,7 @@ def read_square_images(processor: Section, area: Area, options: Options, notes: 
     side = max(1, round(edge * _fraction(processor))) if stated else edge
     resize = {"op": "resize", "filter": "torch_bicubic_16bit"}
     pad = options.letterbox or processor.get("letter_box_transform") is True
-    # A resize that came first would end the pipeline.
+    # The crop of everything is needed because a resize as the first op would end the pipeline.
     ops: List[dict] = [{"op": "square_pad"} if pad else {"op": "crop_fraction", "fraction": 1.0}, {**resize, "width": edge, "height": edge}]
     if side < edge:
         ops.append({"op": "crop_fraction", "fraction": (side + 0.5) / edge})
@@ -88,7 +88,7 @@ def read_square_images(processor: Section, area: Area, options: Options, notes: 
 
 
 def _pair(processor: Section, key: str) -> int:
-    """The side of a square that stands as [height, width], 0 where there is none."""
+    """The side of a square stated as [height, width]; 0 for null."""
     value = processor.get(key)
     if value is None:
         return 0
@@ -122,7 +122,7 @@ def _fraction(processor: Section) -> float:
 
 
 def _camera(given: str, edge: int, pad: bool) -> Tuple[int, int]:
-    """Width and height at which images come to the pipeline, all that matters of them being their aspect."""
+    """Width and height of the pipeline's input images; only their aspect ratio matters."""
     if not given or pad:
         return edge, edge
     parts = given.lower().split("x")
@@ -139,7 +139,7 @@ def _smallest_side(width: int, height: int, edge: int) -> Tuple[int, int]:
 
 
 def held_size(width: int, height: int, area: Area, where: str, problems: Problems) -> Tuple[int, int]:
-    """The size that the backbone's image processor makes of an image (smart_resize). `where` says what the sizes are from."""
+    """The size to which the backbone's image processor resizes an image (smart_resize). `where`: source of the size, for errors."""
     unit = area.multiple
     sides = [max(area.shortest, round(side / unit) * unit) for side in (width, height)]
     size = sides[0] * sides[1]

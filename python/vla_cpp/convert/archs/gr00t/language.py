@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The language model, a Qwen3 of which the policy keeps the first layers: its part of a config."""
+"""The config of the language model, a Qwen3 of which the policy keeps only the first layers."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ...networks import defaults, read_language
 from ...section import Fixed, Section
 from .sizes import Sizes
 
-# Qwen3Config and Qwen3VLTextConfig of transformers, which differ in two keys more.
+# Common defaults of transformers' Qwen3Config and Qwen3VLTextConfig, which differ in two other keys.
 TEXT = defaults(4096, 22016, 32, 32, vocab_size=151936, num_key_value_heads=32, head_dim=128, rms_norm_eps=1e-6)
 TEXT_FIXED: Fixed = {"hidden_act": ("silu", "silu"), "attention_bias": (False, False)}
 
 
 def read(text: Section, kept: int, s: Sizes) -> None:
-    """`kept`: layers from the first on that the policy keeps. The rotary keys are the caller's."""
+    """Reads the config. `kept`: number of first layers that the policy keeps. The caller reads the rotary keys."""
     text.check_fixed(TEXT_FIXED)
     text.nullable = ("num_key_value_heads",)
     s.lm = read_language(text)
@@ -25,7 +25,7 @@ def read(text: Section, kept: int, s: Sizes) -> None:
 
 
 def rope_section(text: Section, defaults: dict) -> Section:
-    """Either spelling of transformers: rope_parameters, or rope_scaling beside rope_theta."""
+    """The rotary settings in either form of transformers: rope_parameters, or rope_scaling beside rope_theta."""
     key = "rope_scaling" if text.get("rope_parameters") is None else "rope_parameters"
     values = member(text.values, key, dict, text.where)
     return Section("{}: {}".format(text.where, key), values, defaults, text.problems)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the checkpoints of LeRobot's GR00T have in common, whichever release they are of: steps of the pipelines, the base, and a robot
-whose states and actions are one vector each, normalized by the statistics of a data set.
+"""The common part of LeRobot's GR00T checkpoints of all releases: steps of the pipelines, the base, and a robot whose states and actions are
+one vector each, normalized by the statistics of a data set.
 
 Reference: lerobot policies/groot/processor_groot.py and configuration_groot.py of 0.4.0 to 0.6.1.
 """
@@ -30,12 +30,12 @@ from .robot import Group, Robot
 PREFIX = "_groot_model."
 CONFIG, PRE, POST = "config.json", recipe.PRE, recipe.POST
 RENAME, BATCH, DEVICE = "rename_observations_processor", "to_batch_processor", "device_processor"
-OTHERS = {  # steps by which other ways of training are told
+OTHERS = {  # steps that identify unsupported kinds of training -> the reason
     "groot_action_unpack_unnormalize_v1": "a step of N1.5, at which LeRobot stops beside the steps of N1.7",
     "relative_actions_processor": "its actions are made relative outside of GR00T's own statistics",
 }
 CONFIG_FIXED: Fixed = {"n_obs_steps": (1, 1), "lora_rank": (0, 0), "use_peft": (False, False)}
-# Of training, of this machine and of the hub, and what the steps state once more.
+# Keys of training, of the machine and of the hub, and keys that the steps repeat.
 CONFIG_IGNORED = set(
     """type input_features output_features device use_amp push_to_hub repo_id private tags license pretrained_path pretrained_revision
     chunk_size n_action_steps max_state_dim max_action_dim normalization_mapping base_model_path embodiment_tag tune_llm tune_visual
@@ -45,14 +45,14 @@ CONFIG_IGNORED = set(
     balance_trajectory_weights dataset_paths output_dir save_steps max_steps batch_size dataloader_num_workers report_to resume
     action_decode_transform rtc_config""".split()
 )
-KIND = "groot_n1_5_min_max"  # 0 where nothing moved, and the data set's number back
+KIND = "groot_n1_5_min_max"  # a column with equal min and max is normalized to 0, and unnormalized to that number
 IMAGES = "observation.images."
 
 
 class Step(NamedTuple):
     where: str
     config: dict
-    state_file: str  # its statistics; "" without
+    state_file: str  # file of the step's statistics; "" without
 
 
 class Vectors(NamedTuple):
@@ -62,14 +62,14 @@ class Vectors(NamedTuple):
     views: List[str]  # in the network's order
     state: Group
     action: Group
-    index: int  # among the robots of the weights
-    n_row: int  # of a chunk, as many as the network has at most
+    index: int  # the robot's index in the weights
+    n_row: int  # rows of a chunk; the network may have fewer
 
     def robot(self, horizon: int) -> Robot:
         return Robot(self.views, [self.state], [self.action], min(self.n_row, horizon))
 
     def keys(self, checkpoint: Checkpoint, n_row: int, options: Options, problems: Problems) -> List[Key]:
-        """Views, states and actions of the bundle, by LeRobot's names."""
+        """Keys of views, states and actions, with LeRobot's names."""
         dims = {recipe.STATE: self.state.width, recipe.ACTION: self.action.width}
         steps = self.config.get("n_action_steps")
         told = {"chunk_size": n_row, "n_action_steps": min(steps, n_row) if type(steps) is int else None}
@@ -78,7 +78,7 @@ class Vectors(NamedTuple):
 
 
 def names_of(checkpoint: Checkpoint, index: int) -> List[str]:
-    """Of the steps of the first or second pipeline."""
+    """Names of the steps of the first (0) or second (1) pipeline."""
     pipelines = checkpoint.processors
     if pipelines is None:
         raise refuse(checkpoint.path(PRE), "LeRobot's pipelines", "none", "save the policy with its processors", Code.UNSUPPORTED)
@@ -87,7 +87,8 @@ def names_of(checkpoint: Checkpoint, index: int) -> List[str]:
 
 
 def read_steps(checkpoint: Checkpoint, before: Sequence[str], after: Sequence[Sequence[str]], problems: Problems) -> Dict[str, Step]:
-    """The steps by their names. `after`: the ways in which the second pipeline may go. Errors: unsupported for other steps."""
+    """The steps by name. `before`: the steps of the first pipeline. `after`: the permitted second pipelines. Errors: unsupported for other
+    steps."""
     found: Dict[str, Step] = {}
     for i, (file, allowed) in enumerate(((PRE, [before]), (POST, after))):
         names = names_of(checkpoint, i)
@@ -117,7 +118,7 @@ def section(step: Step, problems: Problems) -> Section:
 
 
 def cameras(config: dict, notes: List[str], problems: Problems) -> List[str]:
-    """In the order in which LeRobot sorts them."""
+    """The cameras in LeRobot's order, which is sorted by name."""
     policy = Section(CONFIG, config, {}, problems)
     views = listed_views(policy, lambda name, kind: notes.append("input feature {} ({}): not read by this policy".format(name, kind)))
     if not views or not all(view.startswith(IMAGES) for view in views):
@@ -126,7 +127,7 @@ def cameras(config: dict, notes: List[str], problems: Problems) -> List[str]:
 
 
 def action_width(config: dict, step: Section) -> int:
-    """LeRobot cuts the network's columns to those of the feature, then to env_action_dim where that is less."""
+    """Width of the action. LeRobot cuts the network's columns to the feature's width, then to env_action_dim if that is smaller."""
     width = vector_dim(Section(CONFIG, config, {}, step.problems), "output_features", recipe.ACTION, "ACTION")
     if step.count("env_action_dim", minimum=0) not in (0, width):
         step.bad("env_action_dim", "the {} numbers of the feature action, or 0".format(width), hint="LeRobot's factory and its pipelines differ")
@@ -134,7 +135,7 @@ def action_width(config: dict, step: Section) -> int:
 
 
 def state_group(checkpoint: Checkpoint, config: dict, step: Step, clips: bool, problems: Problems) -> Group:
-    """Of the statistics' width, whatever the feature says: LeRobot does not look at it."""
+    """The state, with the width of its statistics, since LeRobot ignores the width in the feature."""
     low, high = statistics(checkpoint, step, recipe.STATE, problems)
     stated = member(config, "input_features", dict, CONFIG).get(recipe.STATE)
     shape = stated.get("shape") if isinstance(stated, dict) else None
@@ -152,7 +153,7 @@ def action_group(checkpoint: Checkpoint, step: Step, width: int, clips: bool, pr
 
 
 def statistics(checkpoint: Checkpoint, step: Step, feature: str, problems: Problems) -> Tuple[np.ndarray, np.ndarray]:
-    """Least and largest numbers. Without them LeRobot passes what it gets: such a policy was saved before it saw a data set."""
+    """Smallest and largest numbers. Refuses a step without them: LeRobot does not normalize then, and the policy was saved before training."""
     where, found = "{}: statistics of {}".format(step.where, feature), []
     if not plain_name(step.state_file):
         problems.unsupported(where, "a file with them beside the JSON", repr(step.state_file), "save the policy after its training")
@@ -172,7 +173,7 @@ def statistics(checkpoint: Checkpoint, step: Step, feature: str, problems: Probl
 
 
 def robot_index(pack: Section) -> int:
-    """LeRobot takes the first robot for a tag that it does not know, and its class's table where none is stated."""
+    """The robot's index. As in LeRobot, an unknown tag has the index 0, and without a stated table the table of the class applies."""
     tag, mapping = pack.get("embodiment_tag"), pack.get("embodiment_mapping")
     if not isinstance(tag, str):
         pack.bad("embodiment_tag", "a name")
@@ -183,28 +184,28 @@ def robot_index(pack: Section) -> int:
 
 
 def check_robot(options: Options, tag: str) -> Options:
-    """The options, with the only robot that there is. Errors: usage."""
+    """The options with the policy's only robot. Errors: usage."""
     if options.embodiment not in ("", tag):
         raise refuse("--embodiment", "{}, the only robot of this policy".format(tag), options.embodiment, code=Code.USAGE)
     return options.replaced(embodiment=tag)
 
 
 def refuse_options(options: Options, names: Dict[str, str]) -> None:
-    """`names`: options that the policy does not leave open, with what states it. Errors: usage."""
+    """Refuses options. `names`: option -> why the policy does not need it. Errors: usage."""
     for name, instead in names.items():
         if getattr(options, name):
             raise refuse("--" + name.replace("_", "-"), "no such option", str(getattr(options, name)), instead, Code.USAGE)
 
 
 def take_over(checkpoint: Checkpoint, arch: str, config: dict) -> None:
-    """Makes the checkpoint one of the authors' layout: its config, and names without what stands in front of all of them."""
+    """Changes the checkpoint to the authors' layout: sets the config and removes the prefix of all tensor names."""
     checkpoint.config, checkpoint.layout, n = config, arch, len(PREFIX)
     checkpoint.tensors = {name[n:]: entry._replace(name=name[n:]) for name, entry in checkpoint.tensors.items()}
     checkpoint.aliases = {name[n:]: other[n:] for name, other in checkpoint.aliases.items()}
 
 
 def base_config(checkpoint: Checkpoint) -> dict:
-    """The sizes of the network. Errors: io."""
+    """The base's config.json, which states the sizes of the network. Errors: io."""
     path = os.path.join(checkpoint.base, CONFIG) if checkpoint.base else ""
     if os.path.isfile(path):
         return read_json(path)

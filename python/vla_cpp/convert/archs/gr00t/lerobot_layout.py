@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""GR00T as LeRobot saves it, `type: groot`: what the authors' files would say. Of N1.5 it is in lerobot_n1_5.py, of N1.7 here.
+"""Converts LeRobot's GR00T checkpoints (`type: groot`) to the authors' layout: N1.7 here, N1.5 in lerobot_n1_5.py.
 
-LeRobot's class has the network under one attribute. Its sizes are those of the base, the policy that was fine-tuned. Cameras, states,
-actions and statistics stand in the steps of the pipelines: those of GR00T, key by key, where the base has them for the robot, or else those
-of the data set, for states and actions as one vector each.
+LeRobot's class has the network as one attribute, with the sizes of the base, the policy that was fine-tuned. The steps of the pipelines state
+cameras, states, actions and statistics: GR00T's own, key by key, if the base has them for the robot; else those of the data set, with one
+vector each for states and actions.
 Reference: lerobot policies/groot/modeling_groot.py, processor_groot.py and configuration_groot.py of 0.6.1.
 """
 
@@ -39,21 +39,21 @@ BEFORE, AFTER = [RENAME, BATCH, PACK, ENCODE, DEVICE], [[DECODE, DEVICE], [UNPAC
 PACK_FIXED: Fixed = {"state_horizon": (1, 1), "language_key": ("task", "task"), "normalize_min_max": (True, True)}
 PACK_READ = """formalize_language embodiment_tag embodiment_mapping clip_outliers use_percentiles video_modality_keys raw_stats modality_config
     max_state_dim max_action_dim""".split()
-OF_GR00T = ("raw_stats", "modality_config", "video_modality_keys")  # of which there are none beside a data set's statistics
-# Of training's masks and noise.
+OF_GR00T = ("raw_stats", "modality_config", "video_modality_keys")  # absent if the statistics are a data set's
+# Keys of masks and noise in training.
 PACK_IGNORED = {"action_horizon", "valid_action_horizon", "state_dropout_prob"}
 ENCODE_READ = ("image_crop_size", "image_target_size", "shortest_image_edge", "crop_fraction", "use_albumentations", "letter_box_transform")
 DECODE_READ = ("env_action_dim", "raw_stats", "modality_config", "use_percentiles", "use_relative_action", "action_decode_transform")
 UNPACK_FIXED: Fixed = {"normalize_min_max": (True, True)}
-# The transform of the gripper is that of config.json, whatever the steps say (_apply_groot_action_decode_transform).
+# config.json determines the gripper's transform, not the steps (_apply_groot_action_decode_transform).
 UNPACK_READ = {"env_action_dim", "clip_normalized_action", "libero_gripper_action", "libero_gripper_binarize"}
-OLD_DEFAULTS = {"chunk_size": 50, "n_action_steps": 50}  # of N1.5, for which GrootConfig takes the new one
+OLD_DEFAULTS = {"chunk_size": 50, "n_action_steps": 50}  # defaults of N1.5, which GrootConfig replaces by NEW_DEFAULT
 NEW_DEFAULT = 40
 TRANSFORMS = {"none": "", "": "", "libero": "libero"}
 
 
 def as_published(checkpoint: Checkpoint, options: Options) -> Options:
-    """Makes of LeRobot's checkpoint one of the authors' layout. Returns the options, with the only robot that there is."""
+    """Changes LeRobot's checkpoint to the authors' layout. Returns the options with the only robot."""
     if lerobot_n1_5.is_n1_5(checkpoint):
         return lerobot_n1_5.as_published(checkpoint, options)
     problems = Problems(checkpoint.name)
@@ -89,13 +89,13 @@ def _check(config: dict, pack: Section, encode: Section) -> None:
 
 
 def _keys(checkpoint: Checkpoint, steps: Dict[str, Step], pack: Section, settings: Dict[str, Any], options: Options, problems: Problems) -> tuple:
-    """The modalities and statistics of GR00T."""
+    """The robot's modalities and statistics, from GR00T's own in the steps."""
     decode = files.section(steps[DECODE], problems)
     decode.refuse_unknown(DECODE_READ)
     for name in PACK_READ:
         if pack.get(name) is None:
             pack.bad(name, "a value", hint="the policy was saved without GR00T's own statistics", unsupported=True)
-    for name in ("modality_config", "use_percentiles", "raw_stats"):  # without which LeRobot leaves actions as they are
+    for name in ("modality_config", "use_percentiles", "raw_stats"):  # without these LeRobot does not decode actions
         if decode.get(name) != pack.get(name):
             decode.bad(name, "the same as of " + PACK, "another")
     robot = dict(member(pack.values, "modality_config", dict, pack.where))
@@ -122,7 +122,7 @@ def _keys(checkpoint: Checkpoint, steps: Dict[str, Step], pack: Section, setting
 
 
 def _check_state(checkpoint: Checkpoint, step: Step, robot: dict, pack: Section, problems: Problems) -> None:
-    """LeRobot normalizes states by the numbers of the step's file, the bundle by those of the keys."""
+    """Checks that the statistics in the step's file, which LeRobot uses for states, equal those of the keys, which the bundle uses."""
     stated = member(member(pack.values, "raw_stats", dict, pack.where), "state", dict, pack.where)
     found = files.statistics(checkpoint, step, STATE, problems)
     for name, numbers in zip(("q01", "q99") if pack.get("use_percentiles") else ("min", "max"), found):
@@ -134,7 +134,7 @@ def _check_state(checkpoint: Checkpoint, step: Step, robot: dict, pack: Section,
 
 
 def _widths(action: dict, pack: Section) -> Dict[str, int]:
-    """Numbers of an action by its keys. What is amiss with the statistics is told where they are read."""
+    """Width of each key of an action. Problems of the statistics are reported where they are read."""
     statistics = member(member(pack.values, "raw_stats", dict, pack.where), "action", dict, pack.where)
     stated = {str(key): statistics.get(key) for key in member(action, "modality_keys", list, pack.where)}
     lists = {key: values.get("min") if isinstance(values, dict) else None for key, values in stated.items()}
@@ -142,7 +142,7 @@ def _widths(action: dict, pack: Section) -> Dict[str, int]:
 
 
 def _vectors(checkpoint: Checkpoint, steps: Dict[str, Step], pack: Section, settings: Dict[str, Any], options: Options, problems: Problems) -> tuple:
-    """A robot of one vector by the statistics of a data set; its modalities and statistics are not those that GR00T's files state."""
+    """Modalities and statistics of a robot with one vector each for states and actions, from a data set's statistics instead of GR00T's."""
     config, unpack = checkpoint.config, files.section(steps[UNPACK], problems)
     files.refuse_options(options, {"gripper_sign": "the gripper is one of the numbers of an action; action_decode_transform of config.json states its sign"})
     unpack.refuse_unknown({*UNPACK_FIXED, *UNPACK_READ})
@@ -178,7 +178,7 @@ def _views(config: dict, pack: Section, notes: List[str], problems: Problems) ->
 
 
 def _transform(config: dict, options: Options, problems: Problems) -> str:
-    """What is done to the gripper in the end: for LIBERO's simulator its sign, unless the config says otherwise."""
+    """The final transform of the gripper: for LIBERO's simulator the sign op, unless the config states another."""
     stated = config.get("action_decode_transform", "auto")
     if stated == "auto":
         stated = "libero" if config.get("embodiment_tag") == "libero_sim" else None
@@ -191,19 +191,20 @@ def _transform(config: dict, options: Options, problems: Problems) -> str:
 
 
 def _add_gripper(checkpoint: Checkpoint, column: int) -> None:
-    """-sign(2 g - 1) of a gripper g."""
+    """Adds the ops that compute -sign(2 g - 1) of a gripper g."""
     ops = [{"op": "affine", "columns": [column], "scale": -2.0, "shift": 1.0}, {"op": "sign", "columns": [column]}]
     checkpoint.documents[END] = {"ops": ops}
 
 
 def _limits(config: dict) -> List[int]:
-    """LeRobot answers no more rows than chunk_size and n_action_steps, of which it replaces the defaults of N1.5."""
+    """Limits of a chunk's rows: LeRobot returns at most chunk_size and n_action_steps rows, and replaces N1.5's defaults of both."""
     found = {name: config.get(name, NEW_DEFAULT) for name in OLD_DEFAULTS}
     return [NEW_DEFAULT if n == OLD_DEFAULTS[name] else n for name, n in found.items() if type(n) is int and n > 0]
 
 
 def _limit_of_base(checkpoint: Checkpoint, pack: Section) -> List[int]:
-    """Nor than the base has steps for the robot, where LeRobot finds its files: in a folder, and not under a name of the hub."""
+    """A further limit of a chunk's rows: the base's action steps for the robot. LeRobot applies it only if the base is a folder, not a name
+    on the hub."""
     path = os.path.join(checkpoint.base, PROCESSOR) if checkpoint.base else ""
     named = str(checkpoint.config.get("base_model_path") or "nvidia/")
     if re.fullmatch(HUB_NAME, named) or not os.path.isfile(path):

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""GR00T N1.5 as LeRobot saved it up to 0.5.1: what its pipelines say of the robot, of images and of the instruction.
+"""GR00T N1.5 in the layout of LeRobot up to 0.5.1: robot, images and instruction as its pipelines state them.
 
-Reference: lerobot policies/groot/processor_groot.py of 0.4.0 to 0.5.1, between which nothing but names of constants changed, and
-policies/factory.py, which normalizes whatever the steps say.
+Reference: lerobot policies/groot/processor_groot.py of 0.4.0 to 0.5.1, which differ only in names of constants, and policies/factory.py,
+which normalizes even if the steps say otherwise.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ ARCH = "gr00t_n1_5"
 PACK, ENCODE, COLLATE, UNPACK = "groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1"
 BEFORE, AFTER = [RENAME, BATCH, PACK, ENCODE, COLLATE, DEVICE], [UNPACK, DEVICE]
 PACK_FIXED: Fixed = {"state_horizon": (1, 1), "language_key": ("task", "task"), "normalize_min_max": (True, True), "formalize_language": (False, False)}
-# max_action_dim and action_horizon are of training's masks.
+# Only masks in training use max_action_dim and action_horizon.
 PACK_READ = {"max_state_dim", "max_action_dim", "action_horizon", "embodiment_tag", "embodiment_mapping"}
 UNPACK_FIXED: Fixed = {"normalize_min_max": (True, True)}
-# Of Eagle25VLProcessor and its image processor. One tile is asked for, so that numbers of tiles and thumbnails change nothing.
+# Settings of Eagle25VLProcessor and its image processor. LeRobot requests one tile, so settings of tiles and thumbnails have no effect.
 TILE_FIXED: Fixed = {**IMAGE_FIXED, "crop_size": (None, None), "do_center_crop": (None, None), "pad_during_tiling": (False, False), "resample": (3, 3)}
 TOKENS_FIXED: Fixed = {"image_token": (IMAGE, IMAGE), "image_start_token": ("<img>", "<img>"), "image_end_token": ("</img>", "</img>"),
                        "image_placeholder": ("image", "image"), "video_placeholder": ("video", "video")}  # fmt: skip
 PROCESSOR = "processor_config.json"
-PLACES = ("<image-", "<video-")  # which its processor replaces wherever they stand
+PLACES = ("<image-", "<video-")  # Eagle's processor replaces these anywhere in a text
 
 
 def is_n1_5(checkpoint: Checkpoint) -> bool:
@@ -46,7 +46,7 @@ def is_n1_5(checkpoint: Checkpoint) -> bool:
 
 
 def as_published(checkpoint: Checkpoint, options: Options) -> Options:
-    """Makes of LeRobot's checkpoint one of the authors' layout, with a robot of one vector. Returns the options, with that robot."""
+    """Changes LeRobot's checkpoint to the authors' layout, with one vector each for states and actions. Returns the options with its robot."""
     problems, own = Problems(checkpoint.name), checkpoint.config
     instead = "LeRobot's files state it"
     files.refuse_options(options, dict.fromkeys(("variant", "camera_size", "letterbox", "gripper_sign"), instead))
@@ -86,7 +86,7 @@ def _check(policy: Section, steps: Dict[str, Step], pack: Section, unpack: Secti
 
 
 def _check_base(base: dict, pack: Section, width: int, problems: Problems) -> None:
-    """LeRobot compares the network's answer with what the base states beside its head."""
+    """Checks that the base's config agrees with its action_head_cfg, since LeRobot compares the network's output with the former."""
     head = base.get("action_head_cfg")
     for key in ("action_horizon", "action_dim"):
         if type(base.get(key)) is not int or not isinstance(head, dict) or base[key] != head.get(key):
@@ -106,12 +106,12 @@ def _tell_queue(config: dict, n_row: int, notes: List[str]) -> None:
 
 
 def text_ops() -> List[dict]:
-    """The authors' instruction is the only member of a list, which the template prints."""
+    """The text ops. The authors pass the instruction as a list with one member, and the template prints this list."""
     return [*({"op": "refuse", "text": place} for place in PLACES), LEROBOT_EMPTY, {"op": "python_list"}]
 
 
 def read_images(folder: str, s: Sizes, problems: Problems) -> Images:
-    """Eagle's processor: one tile of the tower's size, whatever the frame's aspect. `folder`: the backbone's."""
+    """The image ops of Eagle's processor: one tile of the tower's size, for frames of any aspect ratio. `folder`: the backbone's."""
     tile, tokens = (Section("backbone " + name, read_json(os.path.join(folder, name)), {}, problems) for name in (FILE, PROCESSOR))
     tile.check_fixed(TILE_FIXED, EAGLE_2_5.folder)
     side = s.image_width
@@ -123,7 +123,7 @@ def read_images(folder: str, s: Sizes, problems: Problems) -> Images:
 
 
 def _check_template(folder: str, problems: Problems) -> None:
-    """What the template makes of a user's turn is compared with the prompt of the bundle."""
+    """Checks that the chat template renders a user turn to the bundle's prompt."""
     where, template = chat_template.find(folder)
     before, after = EAGLE_2_5.TEMPLATE.before, EAGLE_2_5.TEMPLATE.after
     for n_view, text in ((1, "['go']"), (3, "[\" Pick {{ x }} up,\\n the robot's <|im_end|> \"]")) if template is not None else ():

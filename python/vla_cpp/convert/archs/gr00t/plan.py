@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The bundle of one robot of a checkpoint with processor_config.json, which N1.6 and N1.7 have.
+"""Plans the bundle of one robot of a checkpoint with processor_config.json, that is, of N1.6 and N1.7.
 
-The two differ in their backbone and in what their configs may say: that is a `Release`.
+A `Release` holds the differences between the two: the backbone and the permitted configs.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .sizes import Sizes
 from .vectors import action_ops, feature_description, gripper_ops, state_ops, statistics_of
 
 POLICY = "config.json"
-# Gr00tN1d7Processor of Isaac-GR00T. LeRobot reads an absent size of images otherwise, so that these must be stated, if only as null.
+# Defaults of Isaac-GR00T's Gr00tN1d7Processor. LeRobot has other defaults for image sizes, so these must be stated, possibly as null.
 KWARGS = {
     "modality_configs": None,
     "use_percentiles": False,
@@ -52,7 +52,7 @@ KWARGS_IGNORED = set(
     """random_rotation_angle color_jitter_params model_name max_action_dim max_action_horizon extra_augmentation_config
     state_dropout_prob transformers_loading_kwargs tactile_state_keys tactile_input_shape tactile_embed_dim""".split()
 )
-# Defaults of the authors' classes of both releases, in config.json.
+# Keys of config.json with the defaults of the authors' classes of both releases.
 CONFIG = {
     "backbone_embedding_dim": 2048,
     "hidden_size": 1024,
@@ -77,8 +77,8 @@ FIXED: Fixed = {
     "use_vlln": (True, True),
     "use_alternate_vl_dit": (True, True),
 }
-# Keys of training, of precision and of transformers, and those of images, text and statistics, which processor_config.json states for
-# the processor: that is where the reference reads them.
+# Keys of training, of precision and of transformers; and keys of images, text and statistics, which the reference reads from
+# processor_config.json instead.
 IGNORED = set(
     """
     architectures model_dtype dtype torch_dtype transformers_version _name_or_path model_revision tune_top_llm_layers tune_llm
@@ -93,17 +93,17 @@ IGNORED = set(
 
 
 class Release(NamedTuple):
-    """What a release has of its own."""
+    """The differences of one release."""
 
     model_type: str
     backbone_type: str  # backbone_model_type of config.json, model_type of the processor
-    backbone: Any  # read, read_area, read_prompt, weights, keys, dropped, LM, TEMPLATE
+    backbone: Any  # has read, read_area, read_prompt, weights, keys, dropped, LM, TEMPLATE
     config: Dict[str, object]  # keys of config.json with their defaults, beside CONFIG
-    fixed: Fixed  # beside FIXED
+    fixed: Fixed  # keys with one supported value, beside FIXED
     ignored: Collection[str]
-    embodiments: Dict[str, int]  # indices of tags that embodiment_id.json does not have
-    state_rows: bool = False  # each moment of the state is a token of its own; else all of them are one
-    cuts_rows: bool = True  # a robot with more steps than the head has rows gets what there is; else its reference refuses it
+    embodiments: Dict[str, int]  # indices of tags that are missing in embodiment_id.json
+    state_rows: bool = False  # True: each moment of the state is a token; False: all moments together are one token
+    cuts_rows: bool = True  # True: a robot with more steps than the head's rows gets only these rows; False: the reference refuses it
 
 
 def make_plan(release: Release, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
@@ -146,7 +146,7 @@ def _check_horizon(robot: dict, s: Sizes, options: Options, problems: Problems) 
 
 
 def described(release: Release, checkpoint: Checkpoint) -> List[str]:
-    """Tags of the robots that the checkpoint was trained for, which is what has statistics."""
+    """Tags of the robots that the checkpoint was trained for: those with statistics."""
     problems = Problems(checkpoint.name)
     configs = member(_processor(release, checkpoint, problems).values, "modality_configs", dict, PROCESSOR)
     problems.raise_any()
@@ -156,21 +156,21 @@ def described(release: Release, checkpoint: Checkpoint) -> List[str]:
 
 
 class Parts(NamedTuple):
-    """What a bundle is made of beside the network."""
+    """The parts of a bundle beside the network."""
 
     backbone: Any
-    folder: str  # the backbone's
+    folder: str  # folder of the backbone
     robot: Robot
     images: Images
     clean: List[dict]  # ops on the instruction
-    end: Sequence[dict] = ()  # ops behind those of the actions
+    end: Sequence[dict] = ()  # ops after those of the actions
 
 
 def assemble(parts: Parts, keys: List[Key], rows: Rows, checkpoint: Checkpoint, options: Options, s: Sizes, problems: Problems) -> Plan:
-    """`keys`, `rows`: the network's."""
+    """The plan of a bundle. `keys`, `rows`: those of the network."""
     robot, backbone = parts.robot, parts.backbone
     tokenizer = read_tokenizer(parts.folder, s.lm.n_vocab, problems, checkpoint.notes)
-    problems.raise_any()  # a prompt takes a sound tokenizer
+    problems.raise_any()  # the prompt needs a valid tokenizer
     prompt = backbone.read_prompt(tokenizer, parts.folder, s, problems)
     document = {
         "image": parts.images.ops,
@@ -200,7 +200,7 @@ def _processor(release: Release, checkpoint: Checkpoint, problems: Problems) -> 
         problems.unsupported(PROCESSOR + ": processor_class", repr(name), repr(config.get("processor_class")))
     section = Section(PROCESSOR, member(config, "processor_kwargs", dict, PROCESSOR), KWARGS, problems)
     fixed = {**KWARGS_FIXED, "model_type": (release.backbone_type,) * 2}
-    if checkpoint.documents:  # of LeRobot, which has a pipeline of its own where it is false
+    if checkpoint.documents:  # a LeRobot checkpoint: LeRobot has its own pipeline for false
         del fixed["use_albumentations"]
         section.defaults["use_albumentations"] = False
     section.refuse_unknown({*KWARGS, *STATED, *KWARGS_FIXED, *fixed, *KWARGS_IGNORED})
@@ -215,7 +215,7 @@ def _processor(release: Release, checkpoint: Checkpoint, problems: Problems) -> 
 
 
 def read_sizes(release: Release, config: dict, folder: str, problems: Problems) -> Sizes:
-    """`folder`: the backbone's."""
+    """Reads all sizes. `folder`: the backbone's."""
     defaults = {**CONFIG, **release.config}
     fixed: Fixed = {"model_type": (None, release.model_type), "backbone_model_type": (release.backbone_type,) * 2, **FIXED, **release.fixed}
     s, policy = Sizes(), Section(POLICY, config, defaults, problems, nullable=("diffusion_model_cfg",))
@@ -240,7 +240,7 @@ def network_keys(release: Release, s: Sizes) -> List[Key]:
 
 
 def network_keys_of(backbone: Any, s: Sizes, own: Dict[str, Dict[str, object]]) -> List[Key]:
-    """`own`: what a release has of its own, by module."""
+    """Keys of the network. `own`: further values of a release, by module."""
     chunking = {} if s.rtc_ramp_rate is None else {"policy": dict(rtc_ramp_rate=s.rtc_ramp_rate)}
     return keys_of(own, head.keys(s), chunking, backbone.keys(s), {"lm": s.lm})
 

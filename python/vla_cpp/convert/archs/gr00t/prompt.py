@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The prompt that a chat template makes of images and an instruction, and the positions of the image tokens."""
+"""The prompt that a chat template renders from images and an instruction, and the positions of the image tokens."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from ...tokenizer import TokenizerPlan
 from .sizes import WHERE, Sizes
 
 START, END = "<|im_start|>", "<|im_end|>"
-# The reference cuts no instruction. The bundle states a longest prompt, far above any instruction.
+# Tokens of an instruction. The reference never truncates; the bundle needs a limit, which is far above any instruction.
 N_INSTRUCTION = 512
 
 
 class Template(NamedTuple):
-    """Text around an instruction and its views. `open` may hold {i}, the number of the view from 1."""
+    """The text around an instruction and its views. `open` may contain {i}, the view's number from 1."""
 
     before: str
     after: str
     open: str
     token: str
     close: str
-    behind: bool = False  # the views stand behind the instruction
+    behind: bool = False  # the views come after the instruction
 
     @property
     def special(self) -> List[str]:
-        """The tokens that stand for themselves, in the order in which they are first met."""
+        """The special tokens in the template, in order of first occurrence."""
         found = re.findall(r"<[^< ]+>", self.before + self.open + self.token + self.close + self.after)
         return list(dict.fromkeys(found))
 
 
 class Prompt(NamedTuple):
-    view_starts: List[int]  # index of the first image token of every view, from the end where views stand behind
+    view_starts: List[int]  # index of each view's first image token; counted from the end if the views come after the instruction
     behind: bool
     n_token: int  # the longest prompt
 
@@ -47,7 +47,7 @@ class Prompt(NamedTuple):
         ]
 
 
-# What LeRobot reads in place of an empty instruction (policies/groot/processor_groot.py); the authors' code reads that.
+# LeRobot replaces an empty instruction by this text (policies/groot/processor_groot.py); the authors' code does not.
 LEROBOT_EMPTY = {"op": "if_empty", "text": "Perform the task."}
 
 
@@ -55,7 +55,7 @@ FORMALIZE = [{"op": "lower"}, {"op": "drop_punctuation"}]
 
 
 def text_ops(template: Template, clean: List[dict], prompt: Prompt, s: Sizes) -> List[dict]:
-    """`clean`: what is done to the instruction before it stands in the prompt."""
+    """The text ops. `clean`: ops on the instruction before it is inserted into the prompt."""
     view = {"open": template.open, "token": template.token, "repeat": s.n_view_token, "close": template.close}
     place = {"place": "back"} if template.behind else {}
     return [

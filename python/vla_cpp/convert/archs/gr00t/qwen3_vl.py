@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The backbone of GR00T N1.7, a Qwen3-VL: its config.json, its tensors, its keys, and the areas of the images that it takes.
+"""The backbone of GR00T N1.7, a Qwen3-VL: its config.json, its tensors, its keys, and the image sizes that it accepts.
 
-Keys of the config that its classes do not read stay without effect there too.
+Keys of the config that the classes do not read have no effect in the reference either.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from .sizes import WHERE, Sizes
 VISUAL, LM = "backbone.model.model.visual.", "backbone.model.model.language_model."
 BLOCK = Names("attn.qkv. attn.proj", "mlp.linear_fc1 mlp.linear_fc2", "norm1 norm2")
 OPEN, CLOSE, IMAGE = "<|vision_start|>", "<|vision_end|>", "<|image_pad|>"
-# One turn without a system turn, the images before the instruction.
+# One user turn without a system turn; the images come before the instruction.
 TEMPLATE = Template(START + "user\n", END + "\n", OPEN, IMAGE, CLOSE)
 FOLDER = "--backbone needs the folder of nvidia/Cosmos-Reason2-2B"
-# Qwen3VLVisionConfig, Qwen3VLTextConfig and Qwen3VLConfig of transformers.
+# Defaults of transformers' Qwen3VLVisionConfig, Qwen3VLTextConfig and Qwen3VLConfig.
 VISION = {
     "depth": 27,
     "hidden_size": 1152,
@@ -51,7 +51,7 @@ VISION_FIXED: Fixed = {
 }
 TEXT = {**language.TEXT, "max_position_embeddings": 128000, "rope_theta": 500000.0}
 FILE = "preprocessor_config.json"
-# Qwen2VLImageProcessor of transformers. What is None there must be stated, since its own default is of another model.
+# Keys of transformers' Qwen2VLImageProcessor. A key with None must be stated, since the class's default is for another model.
 SIZES = {"size": None, "min_pixels": None, "max_pixels": None}
 IMAGE_FIXED: Fixed = {
     "do_resize": (True, True),
@@ -72,7 +72,7 @@ IMAGE_IGNORED = set(
 
 
 def read(folder: str, kept: int, s: Sizes, problems: Problems, hint: str = FOLDER) -> None:
-    """`hint`: whose folder --backbone needs."""
+    """Reads the config in a folder. `hint`: says which folder --backbone needs."""
     config = read_json(os.path.join(folder, "config.json"))
     Section(WHERE, config, {}, problems).check_fixed({"model_type": (None, "qwen3_vl")}, hint)
     text = Section(WHERE + ": text_config", member(config, "text_config", dict, WHERE), TEXT, problems)
@@ -126,7 +126,7 @@ def _read_rope(text: Section, s: Sizes) -> None:
 
 
 def read_area(folder: str, s: Sizes, problems: Problems) -> Area:
-    """What smart_resize of its image processor leaves alone."""
+    """The image sizes that smart_resize of the image processor keeps."""
     path = os.path.join(folder, FILE)
     if not os.path.exists(path):
         hint = "it lies beside the backbone's config.json, and says to which sizes images are held"
@@ -150,7 +150,7 @@ def read_area(folder: str, s: Sizes, problems: Problems) -> Area:
 def weights(s: Sizes) -> Rows:
     v = s.vision
     patch, bias = patch_embed(VISUAL + "patch_embed.proj", v.d_model, v.patch_size)
-    # Of both moments of a frame, which are the same frame here.
+    # The patch embedding reads two moments; here both are the same frame.
     side = patch.stored[-1]
     moments = [patch._replace(stored=(v.d_model, 3, 2, side, side), pick=(2, time)) for time in (0, 1)]
     rows = [
@@ -173,7 +173,7 @@ def _merger(target: str, source: str, s: Sizes, d_norm: int) -> Rows:
 
 
 def keys(s: Sizes) -> Dict[str, Mapping[str, object]]:
-    literals = dict(norm_eps=1e-6, rope_base=1e4)  # of the reference
+    literals = dict(norm_eps=1e-6, rope_base=1e4)  # literals of the reference
     own = pick(s, "image_width image_height n_position_side merge deepstack_layers")
     return {"vision": {**s.vision_keys(), **own, **literals}, "lm": dict(rope_sections=s.rope_sections)}
 
@@ -187,7 +187,7 @@ def read_prompt(tokenizer: TokenizerPlan, folder: str, s: Sizes, problems: Probl
 
 
 def _check_ids(folder: str, ids: dict, problems: Problems) -> None:
-    """The network finds image tokens by the config's number, the prompt makes them by the tokenizer's."""
+    """Checks that the config and the tokenizer have the same ids of image tokens: the network finds them by the config's ids."""
     config = read_json(os.path.join(folder, "config.json"))
     for key, default, text in (("image_token_id", 151655, IMAGE), ("vision_start_token_id", 151652, OPEN)):
         if config.get(key, default) != ids[text]:
@@ -195,7 +195,7 @@ def _check_ids(folder: str, ids: dict, problems: Problems) -> None:
 
 
 def _check_template(folder: str, problems: Problems) -> None:
-    """The template is a program of its own: what it makes of a user's turn is compared with the prompt of the bundle."""
+    """Checks that the chat template, which is a program, renders user turns to the bundle's prompt."""
     where, template = chat_template.find(folder)
     if template is None:
         return

@@ -19,12 +19,12 @@ from ...options import Option
 from ...section import Section
 
 PROCESSOR, STATISTICS, EMBODIMENTS = "processor_config.json", "statistics.json", "embodiment_id.json"
-END = "ops behind those of the actions"  # a document of LeRobot's checkpoints
+END = "ops behind those of the actions"  # name of an entry in Checkpoint.documents, for LeRobot's checkpoints
 DOCS = "docs/converting.md, GR00T"
 MODALITY = {"delta_indices", "modality_keys", "sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"}
 NAMES = {"min", "max", "mean", "std", "q01", "q99"}  # statistics of a key
 MAX_WIDTH = 1 << 16
-ROBOT_OPTIONS = (  # what every release leaves open
+ROBOT_OPTIONS = (  # options of every release
     Option(
         "--embodiment",
         "tag of the robot in processor_config.json; required. A,B,... puts several into one bundle, all every one that has statistics;"
@@ -41,36 +41,36 @@ ROBOT_OPTIONS = (  # what every release leaves open
 )
 
 
-# How the numbers of a key are normalized: a kind of the recipe's ops normalize and unnormalize, one of these, or "" for as they are.
+# Kinds of normalization of a key's numbers: a kind of the recipe's ops normalize and unnormalize, one of these two, or "" for none.
 SIN_COS, BINARY = "sin_cos", "binary"
 RANGE, DEVIATION = "groot_min_max", "groot_mean_std"
-POSES = {"XYZ_ROT6D": 9, "XYZ_ROTVEC": 6}  # formats of poses, and how many numbers they have
+POSES = {"XYZ_ROT6D": 9, "XYZ_ROTVEC": 6}  # formats of poses -> number of numbers
 
 
 class Group(NamedTuple):
-    """The numbers that stand under one key of states or actions."""
+    """The numbers of one key of states or actions."""
 
     key: str
     width: int
     kind: str
     low: np.ndarray  # min, the lower quantile, or mean: (width,), or (row of a chunk, width)
     high: np.ndarray  # max, the upper quantile, or std
-    clips: bool = False  # normalized they are held between -1 and 1
-    reference: str = ""  # of a relative action: the state's key that it is relative to
-    pose: str = ""  # of a relative pose: its format
-    rotation: Optional[Dict[str, str]] = None  # of a key that the network has in another representation: fields of the op
+    clips: bool = False  # normalized numbers are clipped to [-1, 1]
+    reference: str = ""  # for a relative action: key of the state that it is relative to
+    pose: str = ""  # for a relative pose: its format
+    rotation: Optional[Dict[str, str]] = None  # fields of the op, if the network has the rotation in another representation
 
 
 class Robot(NamedTuple):
     cameras: List[str]
     states: List[Group]
     actions: List[Group]
-    n_row: int  # actions of a chunk that are meant for this robot
+    n_row: int  # rows of a chunk that the robot gets
     n_moment: int = 1  # time steps of the state; the groups of each follow those of the previous one
 
 
 def processor_file(checkpoint: Checkpoint, name: str) -> dict:
-    """Beside the weights or below processor/. Errors: bad_bundle where both exist, io where none does."""
+    """The JSON file of that name beside the weights or in processor/. Errors: bad_bundle if both exist, io if none does."""
     if name in checkpoint.documents:
         return checkpoint.documents[name]
     places = [place for place in (name, os.path.join("processor", name)) if os.path.exists(checkpoint.path(place))]
@@ -89,7 +89,7 @@ def _keys(config: dict, modality: str) -> List[str]:
 
 
 def choose(configs: dict, tag: str) -> dict:
-    """The modalities of a tag. Errors: usage, with the tags that there are."""
+    """The modalities of a tag. Errors: usage, listing the tags."""
     if tag in configs and isinstance(configs[tag], dict):
         return configs[tag]
     listed = "; ".join("{} (cameras {})".format(name, ", ".join(_keys(value, "video")) or "none") for name, value in configs.items())
@@ -103,8 +103,7 @@ def choose(configs: dict, tag: str) -> dict:
 
 
 def embodiment_index(checkpoint: Checkpoint, tag: str, built_in: Dict[str, int], n_embodiment: int, problems: Problems) -> int:
-    """The row of the weights that belongs to a tag. `built_in`: what the authors' processor gives to tags that
-    embodiment_id.json does not have."""
+    """The tag's index in the weights. `built_in`: the authors' indices of tags that are missing in embodiment_id.json."""
     stated = processor_file(checkpoint, EMBODIMENTS)
     if tag not in stated and tag in built_in:
         checkpoint.notes.append("{} has no {}: index {}, as in the authors' table".format(EMBODIMENTS, tag, built_in[tag]))
@@ -116,7 +115,7 @@ def embodiment_index(checkpoint: Checkpoint, tag: str, built_in: Dict[str, int],
 
 
 def check_widths(where: str, stated: dict, names: Sequence[str], width: int, problems: Problems) -> None:
-    """Checks the statistics of a key that are not used: LeRobot takes the key's width from the mean. They may have a row for each action."""
+    """Checks the width of a key's unused statistics, since LeRobot takes the key's width from the mean. They may have a row per action."""
     for name in sorted(NAMES.intersection(stated) - set(names)):
         values = stated[name]
         row = values[0] if isinstance(values, list) and values and isinstance(values[0], list) else values
@@ -149,7 +148,7 @@ class _Reader:
         return [key for key in member(section.values, name, list, section.where) if isinstance(key, str)]
 
     def statistic(self, part: str, key: str, names: Tuple[str, str], n_row: int = 0) -> List[np.ndarray]:
-        """Two statistics of a key. `n_row`: how many rows they must have at least where there is one for each action of a chunk."""
+        """Two statistics of a key. `n_row`: their least number of rows, if they have one row per action of a chunk."""
         where = "{}: {}.{}.{}".format(STATISTICS, self.tag, part, key)
         stated = member(member(self.statistics, part, dict, where), key, dict, where)
         found = [self.numbers("{}.{}".format(where, name), stated.get(name), n_row) for name in names]
@@ -172,7 +171,7 @@ class _Reader:
             return np.zeros(1)
         if nested and len(rows) < n_row:
             self.problems.add(where, "a row for each of {} actions".format(n_row), "{} rows".format(len(rows)))
-        with np.errstate(over="ignore"):  # told below
+        with np.errstate(over="ignore"):  # reported below
             fits = np.isfinite(np.asarray(rows, np.float64).astype(np.float32))
         if not fits.all():
             self.problems.add(where, "numbers that float32 holds", str(np.asarray(rows)[~fits][0]))
@@ -190,17 +189,17 @@ class _Reader:
         for key in section.get("modality_keys"):
             kind = SIN_COS if key in turns else DEVIATION if key in mean_std else RANGE
             low, high = self.statistic("state", key, ("mean", "std") if kind == DEVIATION else self.range_names())
-            if kind == RANGE:  # the reference gives 0 where it finds the two close, which is by their size
+            if kind == RANGE:  # the reference normalizes to 0 if the two are close relative to their size
                 high = np.where(np.isclose(high, low), low, high)
             groups.append(Group(key, low.size, kind, low, high, kind == RANGE and self.clips))
-        # Actions are relative to the newest state, which is found by its key alone where it is of now.
+        # Each moment's state has its own key. The suffix of the current moment is empty, so relative actions find it by the plain key.
         return [group._replace(key=group.key + suffix) for suffix in suffixes for group in groups]
 
     def actions(self, states: Sequence[Group], n_row: int) -> List[Group]:
         section = self.modality("action")
         configs = member(section.values, "action_configs", list, section.where)
         keys, mean_std = section.get("modality_keys"), self.listed(section, "mean_std_embedding_keys")
-        if not configs:  # null: all of them absolute
+        if not configs:  # null: all actions are absolute
             configs = [{"rep": "ABSOLUTE"}] * len(keys)
         if len(configs) != len(keys) or not all(isinstance(config, dict) for config in configs):
             section.bad("action_configs", "a JSON object for each of {} keys".format(len(keys)), str(configs)[:80])
@@ -216,7 +215,7 @@ class _Reader:
         return groups
 
     def relative_group(self, group: Group, how: Section, widths: Dict[str, int], n_row: int) -> Group:
-        """The same key by the statistics of its relative actions, which are never percentiles. `widths`: of the states."""
+        """The group of a relative action, with the statistics of its relative values, which are never percentiles. `widths`: of the states."""
         reference = str(how.get("state_key") or group.key) + moment_suffix(moments(self.modality("state"))[-1])
         pose = self.pose(how, group.width)
         names = ("mean", "std") if group.kind == DEVIATION else ("min", "max")
@@ -238,7 +237,7 @@ class _Reader:
         return rep == "RELATIVE" and bool(self.relative)
 
     def pose(self, how: Section, width: int) -> str:
-        """The format of a relative pose; "" where the numbers are added one by one."""
+        """The format of a relative pose; "" if the numbers are added elementwise."""
         kind, pose = how.get("type"), how.get("format")
         if kind == "NON_EEF":
             if pose != "DEFAULT":
@@ -254,7 +253,7 @@ class _Reader:
 
 
 def moments(section: Section) -> List[int]:
-    """When frames or states are taken, in control steps from now on."""
+    """The times of frames or states, in control steps relative to the current one (0 or negative)."""
     steps = section.get("delta_indices")
     sound = isinstance(steps, list) and steps and all(type(t) is int and -1000 <= t <= 0 for t in steps)
     if sound and sorted(set(steps)) == steps:
@@ -264,17 +263,17 @@ def moments(section: Section) -> List[int]:
 
 
 def moment_suffix(step: int) -> str:
-    """A frame or a state of 15 steps ago is a feature of its own, name@-15."""
+    """The suffix of a feature's name: a frame or state of 15 steps ago is the separate feature name@-15."""
     return "@{}".format(step) if step else ""
 
 
 def views(video: Section) -> List[str]:
-    """Every camera at every moment, the moments in the order of `delta_indices` and in each the cameras."""
+    """Names of every camera at every moment: moments in the order of `delta_indices`, and within each the cameras."""
     return [key + moment_suffix(t) for t in moments(video) for key in video.get("modality_keys")]
 
 
 def read_robot(tag: str, config: dict, statistics: dict, processor: Section, horizon: int, problems: Problems) -> Robot:
-    """`processor`: the members of processor_kwargs. `horizon`: rows of the network's chunk, of which the first are the robot's."""
+    """Reads a robot. `processor`: the members of processor_kwargs. `horizon`: rows of the network's chunk, of which the robot gets the first."""
     reader = _Reader(tag, config, statistics, processor, problems)
     video = reader.modality("video")
     cameras = views(video)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Widths and counts of GR00T, which the configs of the policy and of its backbone state."""
+"""Widths and counts of GR00T, from the configs of the policy and of its backbone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Sizes:
     image_width: int = 0
     image_height: int = 0
     n_position_side: int = 0
-    merge: int = 2  # patches on a side of what becomes one token
+    merge: int = 2  # patches per side of the square that becomes one token
     deepstack_layers: List[int] = field(default_factory=list)
     lm: Language = field(default_factory=Language)
     n_context: int = 0
@@ -34,18 +34,18 @@ class Sizes:
     attend_text_every_n_blocks: int = 0
     n_bucket: int = 0
     d_hidden: int = 0
-    d_state: int = 0  # of what becomes a token: all moments of state_history_length
+    d_state: int = 0  # numbers in a state token: all moments of state_history_length
     state_history: int = 1
-    n_state_row: int = 1  # tokens of the state, where each moment is one
+    n_state_row: int = 1  # tokens of the state, if each moment is a token
     d_action: int = 0
     horizon: int = 0
     n_position: int = 0
     n_step: int = 0
-    rtc_ramp_rate: Optional[float] = None  # where the release knows real-time chunking
+    rtc_ramp_rate: Optional[float] = None  # None: the release has no real-time chunking
     n_embodiment: int = 0
-    embodiment: int = 0  # index among them
+    embodiment: int = 0  # the robot's index, below n_embodiment
     max_views: int = 0
-    d_time: int = 256  # a literal of the reference, as is the factor 4 of the feed-forward parts
+    d_time: int = 256  # a literal of the reference, like the factor 4 of the feed-forward layers
 
     @property
     def d_vl_ff(self) -> int:
@@ -56,7 +56,7 @@ class Sizes:
         return 4 * self.d_dit
 
     def vision_keys(self) -> Dict[str, object]:
-        """What the towers of all releases have."""
+        """Key values that the towers of all releases have."""
         return pick(self.vision, "d_model n_layer n_head d_ff patch_size")
 
     @property

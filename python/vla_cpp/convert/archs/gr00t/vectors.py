@@ -16,7 +16,7 @@ from .. import Options
 from .robot import BINARY, DEVIATION, PROCESSOR, RANGE, SIN_COS, STATISTICS, Group, Robot
 from .sizes import Sizes
 
-# The statistics that a kind of normalization reads.
+# Kind of normalization -> the statistics that it reads.
 NAMES = {
     RANGE: ("min", "max"),
     DEVIATION: ("mean", "std"),
@@ -38,7 +38,7 @@ def _columns(groups: Sequence[Group], holds: Callable[[Group], bool]) -> List[in
 
 
 def _on(groups: Sequence[Group], holds: Callable[[Group], bool], op: dict) -> List[dict]:
-    """The op on the columns of the groups that it is meant for; nothing where there are none."""
+    """The op on the columns of the groups for which `holds` is true; empty if there are none."""
     columns = _columns(groups, holds)
     if not columns:
         return []
@@ -79,7 +79,7 @@ def state_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
         *_normalize("normalize", recipe.STATE, robot.states),
         *_clip(robot.states),
         *([{"op": "sin_cos", "columns": turns}] if turns else []),
-        *reversed(_rotations(robot.states)),  # of which each moves what is behind it
+        *reversed(_rotations(robot.states)),  # from the last: each op shifts the columns after it
         {"op": "pad", "size": s.d_state * s.n_state_row, **rows},
     ]
 
@@ -100,7 +100,7 @@ def action_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
 
 
 def gripper_ops(robot: Robot, key: str, problems: Problems) -> List[dict]:
-    """The sign that a simulator wants of a gripper whose actions count from 0, closed, to 1, open: -sign(2 g - 1)."""
+    """The op that converts a gripper's action g, from 0 (closed) to 1 (open), to the sign that a simulator expects: -sign(2 g - 1)."""
     starts = _starts(robot.actions)
     if key not in starts:
         problems.add("--gripper-sign", "a key of the actions: " + ", ".join(starts), key, code=Code.USAGE)
@@ -138,7 +138,7 @@ def _names(groups: Sequence[Group]) -> List[str]:
 
 
 def feature_description(robot: Robot, options: Options, notes: List[str], problems: Problems) -> List[Key]:
-    """All cameras are needed. Numbers are named by their keys where no data set names them."""
+    """Keys of views, states and actions. All cameras are required. Without a data set, numbers have the names of their keys."""
     views, n = [view_name(key) for key in robot.cameras], len(robot.cameras)
     if len(set(views)) != n:
         problems.add(PROCESSOR + ": video: modality_keys", "cameras of different names", ", ".join(views))
@@ -156,8 +156,8 @@ def feature_description(robot: Robot, options: Options, notes: List[str], proble
 
 
 def statistics_of(feature: str, groups: Sequence[Group]) -> Dict[str, np.ndarray]:
-    """Of all keys, one after the other, by the name of the bundle's tensor: 0 for a key that is normalized in another way, and a row for
-    each action of a chunk where a key has such."""
+    """Statistics of all keys, concatenated, by the name of the bundle's tensor. A key with another kind of normalization has 0. If a key has
+    statistics per action of a chunk, there is a row per action."""
     found: Dict[str, np.ndarray] = {}
     for kind, names in NAMES.items():
         chosen = [group for group in groups if group.kind == kind]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""OpenVLA: DINOv2 and SigLIP side by side, and a Llama 2 that answers a token for each number of an action.
+"""OpenVLA: DINOv2 and SigLIP in parallel, and a Llama 2 that generates a token for each number of an action.
 
-A checkpoint is a folder as transformers saves it. Statistics of all data sets that it was trained on are in config.json; a fine-tune has
-those of its own in dataset_statistics.json, which their evaluation reads in the place of them.
+A checkpoint is a folder saved by transformers. config.json has the statistics of all data sets of the training; a fine-tune has its own in
+dataset_statistics.json, which the authors' evaluation reads instead.
 
 Reference: openvla prismatic/extern/hf (modeling_prismatic.py, processing_prismatic.py), experiments/robot/openvla_utils.py.
 """
@@ -36,9 +36,9 @@ STATISTICS, IMAGES, TOKENIZER, GENERATION = (
 )
 VIEW, ALIAS = "image", "full_image"
 QUESTION, ANSWER = "In: What action should the robot take to ", "?\nOut:"
-EMPTY, EMPTY_ID = "\u2581", 29871  # behind every prompt: a blank that no word follows, with its id in Llama 2's vocabulary
-MAX_TOKENS = 256  # of a prompt, far above any instruction: the reference cuts none
-# What their functions of images are made from, where a file states the results as well.
+EMPTY, EMPTY_ID = "\u2581", 29871  # the last token of every prompt, a blank without a word, and its id in Llama 2's vocabulary
+MAX_TOKENS = 256  # tokens of a prompt; far above any instruction, since the reference truncates none
+# Parameters of the authors' image functions, which a file may state beside the values that they derive from.
 NORMALIZE = "tvf_normalize_params"
 DERIVED = {"tvf_resize_params", "tvf_crop_params", NORMALIZE, "tvf_do_letterbox", "tvf_letterbox_fill"}
 IMAGES_IGNORED = {"auto_map", "image_processor_type", "processor_class", "feature_extractor_type"}
@@ -47,7 +47,7 @@ IMAGES_FIXED: Fixed = {
     "image_resize_strategy": ("letterbox", "resize-naive"),
     "interpolations": (None, ["bicubic", "bicubic"]),
 }
-# Of what their call leaves to the file: it draws nothing, whatever the file says of drawing.
+# Keys of generation_config.json without effect on the answer: the authors' call never samples.
 GENERATION_IGNORED = {
     *("_from_model_config", "bos_token_id", "pad_token_id", "transformers_version", "do_sample", "temperature", "top_k", "top_p"),
     *("max_length", "max_new_tokens", "use_cache"),
@@ -86,7 +86,7 @@ def _recipe(side: int, mask: List[bool]) -> Dict[str, List[dict]]:
         "action": [
             {
                 "op": "unnormalize",
-                "kind": "openpi_quantiles",  # the same formula, on statistics in float64
+                "kind": "openpi_quantiles",  # the formula is the same, with statistics in float64
                 "eps": 0.0,
                 "stats": "stats." + recipe.ACTION,
                 "columns": [i for i, on in enumerate(mask) if on],
@@ -112,7 +112,7 @@ LAYOUT = Layout(
 
 
 def chosen_statistics(checkpoint: Checkpoint, name: str) -> Tuple[dict, str]:
-    """Of a data set, and where they stand: a fine-tune's own file, otherwise config.json. Errors: bad_bundle."""
+    """The statistics of a data set, and their place: the fine-tune's own file if there is one, else config.json. Errors: bad_bundle."""
     own = os.path.exists(checkpoint.path(STATISTICS))
     everything = read_json(checkpoint.path(STATISTICS)) if own else member(checkpoint.config, "norm_stats", dict, WHERE)
     where = STATISTICS if own else WHERE + ": norm_stats"
@@ -124,7 +124,7 @@ def chosen_statistics(checkpoint: Checkpoint, name: str) -> Tuple[dict, str]:
 
 
 def _statistics(checkpoint: Checkpoint, name: str, problems: Problems) -> Tuple[Dict[str, np.ndarray], List[bool]]:
-    """In float64, as the reference reads them, and which numbers of an action are un-normalized."""
+    """The statistics, in float64 as in the reference, and which numbers of an action are unnormalized."""
     entry, where = chosen_statistics(checkpoint, name)
     stated = member(entry, "action", dict, where)
     where += ".action"
@@ -144,7 +144,7 @@ def _statistics(checkpoint: Checkpoint, name: str, problems: Problems) -> Tuple[
 
 
 def _check_generation(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> None:
-    """What the file states replaces what config.json says of the end of an answer."""
+    """Reads generation_config.json, whose stop token replaces the one in config.json."""
     if not os.path.exists(checkpoint.path(GENERATION)):
         return
     section = Section(GENERATION, read_json(checkpoint.path(GENERATION)), {}, problems)
@@ -153,8 +153,8 @@ def _check_generation(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> N
 
 
 def read_pixels(checkpoint: Checkpoint, side: int, problems: Problems) -> List[Dict[str, tuple]]:
-    """By tower what is subtracted from pixels, and what they are divided by: in float32, as torchvision does. What the file states of the
-    results replaces what they would be made from (transformers ImageProcessingMixin.__init__), as in VLA-Adapter's files."""
+    """Mean and std of the pixels of each tower, in float32 as in torchvision. Derived parameters in the file replace the values that they would
+    be derived from (transformers ImageProcessingMixin.__init__), as in VLA-Adapter's files."""
     images = Section(IMAGES, read_json(checkpoint.path(IMAGES)), {}, problems)
     images.check_fixed(IMAGES_FIXED)
     images.refuse_unknown({*IMAGES_FIXED, *IMAGES_IGNORED, *DERIVED, "input_sizes", "means", "stds"})
@@ -205,7 +205,7 @@ def _channels(images: Section, key: str, i: int, above: float) -> List[float]:
 
 
 def check_prompt(checkpoint: Checkpoint, tokenizer: TokenizerPlan, s: Sizes, problems: Problems) -> int:
-    """That one token stands in front of a prompt, and the image behind it. Returns the empty token's id."""
+    """Checks that every prompt begins with one token, after which the image tokens come. Returns the id of the empty token."""
     config, keys = read_json(checkpoint.path(TOKENIZER)), {key.name: key.value for key in tokenizer.keys}
     if config.get("add_prefix_space") is not None:
         hint = "the reference then makes the tokenizer of tokenizer.model"

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of OpenVLA and the names of its tensors. config.json names the vision towers after timm's models, which state heads, patches and
-norms; widths and depths are those of the tensors. An absent key of the language model means the default of the reference's LlamaConfig, which
-stands beside the key.
+"""Sizes of OpenVLA and the names of its tensors. config.json gives timm's names of the vision towers, which determine heads, patches and norms;
+widths and depths come from the tensors. An absent key of the language model has the default of the reference's LlamaConfig, listed here with
+the key.
 
 Reference: openvla prismatic/extern/hf (configuration_prismatic.py, modeling_prismatic.py); timm 0.9.16 vision_transformer.py; transformers
 4.40.1 models/llama.
@@ -27,7 +27,7 @@ from ...standardized import Standardized
 from .. import MATRIX, VECTOR, Dropped, Weight
 
 WHERE = "config.json"
-# timm's models: heads, side of a patch. Norms have its eps.
+# timm's models of the towers. All have the same number of heads, side of a patch, and eps of norms.
 DINO_ID, SIGLIP_IDS = "vit_large_patch14_reg4_dinov2.lvd142m", ("vit_so400m_patch14_siglip_224", "vit_so400m_patch14_siglip_384")
 N_HEAD, PATCH, NORM_EPS = 16, 14, 1e-6
 DINO, SIGLIP, PROJECTOR, LM, HEAD = (
@@ -52,7 +52,7 @@ TEXT_FIXED: Fixed = {
     "rope_scaling": (None, None),
     "tie_word_embeddings": (False, False),
 }
-# Keys of transformers and of training, and those that no forward pass reads: what images go through is preprocessor_config.json's.
+# Keys of transformers and of training, and keys that no forward pass reads: preprocessor_config.json determines the image ops.
 IGNORED = set(
     """
     _name_or_path arch_specifier architectures auto_map attention_dropout bos_token_id dtype hf_llm_id image_resize_strategy image_sizes
@@ -70,7 +70,7 @@ class Sizes:
     n_register: int = 0
     d_action: int = 0
     n_bin: int = 0
-    first_id: int = 0  # the token of bin 0; the others go down from here
+    first_id: int = 0  # token id of bin 0; the ids of further bins decrease from here
     stop_token: int = 0
     horizon = 1
     d_state = 0
@@ -96,7 +96,7 @@ def read_sizes(checkpoint: Checkpoint, problems: Problems) -> Sizes:
 
 
 def text_section(checkpoint: Checkpoint, keys: Dict, fixed: Fixed, ignored: Set[str], problems: Problems) -> Section:
-    """The language model's part of config.json. `keys`: its keys and the defaults of the reference's class."""
+    """The language model's part of config.json. `keys`: supported keys with the defaults of the reference's class."""
     text = member(checkpoint.config, "text_config", dict, WHERE)
     section = Section(WHERE + ": text_config", text, keys, problems, ("num_key_value_heads",))
     section.check_fixed(fixed)
@@ -150,7 +150,7 @@ def _dim(checkpoint: Checkpoint, name: str, rank: int, axis: int, problems: Prob
 
 
 def _tower(checkpoint: Checkpoint, at: str, side: int, problems: Problems) -> Vision:
-    """As far as the block whose patches are read: the last but one."""
+    """The sizes of a tower up to the block whose output is used, the last but one."""
     found = (re.match(re.escape(at) + r"blocks\.(\d{1,4})\.", name) for name in checkpoint.tensors)
     depth = 1 + max((int(match[1]) for match in found if match), default=-1)
     d, d_ff = _dim(checkpoint, at + "pos_embed", 3, 2, problems), _dim(checkpoint, at + "blocks.0.mlp.fc1.weight", 2, 0, problems)
@@ -162,7 +162,7 @@ def _tower(checkpoint: Checkpoint, at: str, side: int, problems: Problems) -> Vi
 
 
 def module_keys(s: Sizes) -> Dict[str, Fields]:
-    """Of the towers and the language model."""
+    """Key values of the towers and the language model, by module."""
     dino, siglip = {**vars(s.dino), "n_register": s.n_register}, {**vars(s.siglip), "position_rule": "row_major"}
     return {"dino": dino, "siglip": siglip, "lm": s.lm}
 
@@ -179,12 +179,12 @@ def network_keys(s: Sizes) -> List[Key]:
 
 
 def weights(s: Sizes, pixels: Tuple[Dict[str, tuple], Dict[str, tuple]]) -> Rows:
-    """`pixels`: mean and std of what each tower reads."""
+    """Rows of all tensors. `pixels`: mean and std of each tower's pixels."""
     return [*image_weights(s, pixels), *decoder(s.lm, LM), *linear("lm.head", HEAD, s.lm.n_vocab, s.lm.d_model, bias=False)]
 
 
 def image_weights(s: Sizes, pixels: Tuple[Dict[str, tuple], Dict[str, tuple]]) -> Rows:
-    """Towers and projector."""
+    """Rows of towers and projector. `pixels`: mean and std of each tower's pixels."""
     dino, siglip, d = s.dino, s.siglip, s.lm.d_model
     d_patch = dino.d_model + siglip.d_model
     return [
@@ -212,7 +212,7 @@ def _patch_embed(target: str, source: str, v: Vision, pixels: Dict[str, tuple]) 
 
 
 def dropped(s) -> List[Dropped]:
-    """What stands behind the block whose patches are read."""
+    """The tensors after the block whose output is used."""
     out = []
     for at, v, names in ((DINO, s.dino, DINO_BLOCK), (SIGLIP, s.siglip, SIGLIP_BLOCK)):
         last = blocks("", at + "blocks.{}.", names, v.n_layer + 1, v.d_model, v.d_ff)

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""OpenVLA-OFT: OpenVLA's towers and Llama 2 on several cameras and a state, which fill a whole chunk in one pass or in steps of diffusion.
+"""OpenVLA-OFT: OpenVLA's towers and Llama 2 with several cameras and a state, which compute a whole chunk in one pass or in diffusion steps.
 
-A checkpoint is a folder of OpenVLA with merged weights, and beside them a file of torch.save for the action head, and, where the policy has
-them, for the projectors of state and noisy actions and for towers with FiLM. The robot is a set of constants in their code, chosen by a word
-in the command line of a training run; the number of cameras and of diffusion steps are arguments of their evaluation. None of these is in
-any file.
+A checkpoint is a folder of OpenVLA with merged weights, and beside them a torch.save file of the action head and, if the policy has them, of
+the projectors of state and noisy actions and of towers with FiLM. A robot is a set of constants in the authors' code, chosen by a word in the
+command line of a training run; the numbers of cameras and diffusion steps are arguments of their evaluation. No file states any of these.
 
 Reference: moojink/openvla-oft (prismatic/extern/hf/modeling_prismatic.py, prismatic/vla/constants.py, experiments/robot/openvla_utils.py,
 experiments/robot/libero/run_libero_eval.py, experiments/robot/aloha/aloha_utils.py).
@@ -33,7 +32,7 @@ OPTIONAL_PARTS = ("proprio_projector", "noisy_action_projector", "vision_backbon
 
 
 class Norm(NamedTuple):
-    """How numbers become -1 to 1: the recipe's kind, and the statistics that it reads."""
+    """A normalization to [-1, 1]: the recipe's kind, and the statistics that it reads."""
 
     kind: str
     names: Tuple[str, str]
@@ -45,7 +44,7 @@ NORMS = {"bounds_q99": Norm("openpi_quantiles", ("q01", "q99")), "bounds": Norm(
 class Platform(NamedTuple):
     horizon: int
     norm: str
-    d_action: int = 0  # 0: as the checkpoint has it
+    d_action: int = 0  # 0: the checkpoint's width
     d_state: int = 0
 
 
@@ -54,9 +53,9 @@ PLATFORMS = {
     "aloha": Platform(25, "bounds", 14, 14),
     "bridge": Platform(5, "bounds_q99", 7, 7),
 }
-OTHER = r"(\d{1,4}),(bounds_q99|bounds)"  # what of constants.py a file does not tell
-MAX_ROWS = 4096  # of a chunk
-ALOHA_SIDE = 256  # its client first makes such squares of frames
+OTHER = r"(\d{1,4}),(bounds_q99|bounds)"  # rows of a chunk and normalization: the values of constants.py that no file states
+MAX_ROWS = 4096  # rows of a chunk
+ALOHA_SIDE = 256  # ALOHA's client first resizes frames to squares of this side
 VIEWS = {
     "libero": dict(zip(oft.VIEWS, oft.ALIASES)),
     "aloha": {"cam_high": "full_image", "cam_left_wrist": "left_wrist_image", "cam_right_wrist": "right_wrist_image"},
@@ -95,14 +94,14 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def _image_ops(side: int, options: Options) -> List[dict]:
-    """An op on the whole image lets another resize follow."""
+    """The image ops. The crop of the whole image is there so that a second resize may follow."""
     square = {"op": "resize", "width": ALOHA_SIDE, "height": ALOHA_SIDE, "filter": "pillow_bicubic"}
     client = [{"op": "crop_fraction", "fraction": 1.0}, square] if options.platform == "aloha" else []
     return [*client, *oft.image_ops(side, options.plain_images)]
 
 
 def _platform(name: str, s: Sizes, problems: Problems) -> Platform:
-    """What prismatic/vla/constants.py has for a robot."""
+    """The constants of prismatic/vla/constants.py for a robot."""
     found, own = PLATFORMS.get(name), re.fullmatch(OTHER, name)
     if found is None and own and 0 < int(own[1]) <= MAX_ROWS:
         found = Platform(int(own[1]), own[2])
@@ -119,7 +118,7 @@ def _platform(name: str, s: Sizes, problems: Problems) -> Platform:
 
 
 def _read_steps(checkpoint: Checkpoint, stated: str, s: Sizes, problems: Problems) -> None:
-    """Of a diffusion head."""
+    """Reads the numbers of steps of a diffusion head."""
     noisy = any(name.startswith(NOISY) for name in checkpoint.tensors)
     if head_of(checkpoint) != DIFFUSION:
         if noisy:
@@ -139,7 +138,7 @@ def _read_steps(checkpoint: Checkpoint, stated: str, s: Sizes, problems: Problem
 
 
 def _views(names: List[str], platform: str, problems: Problems) -> List[Key]:
-    """All required, in the order in which the policy was trained with them."""
+    """Keys of the views: all are required, in the order of the training."""
     known: Dict[str, str] = VIEWS.get(platform, {})
     if not names:
         hint = "--views {}: as many as num_images_in_input, which no file states".format(",".join(known) or "A,B")

@@ -22,11 +22,11 @@ from .. import Dropped, oft
 from ..openvla import mapping as openvla
 from ..openvla.mapping import DINO, HEAD, LM, SIGLIP
 
-NOISY, VISION = "noisy_action_projector.", "vision_backbone."  # what names of their files' tensors begin with
+NOISY, VISION = "noisy_action_projector.", "vision_backbone."  # prefixes of tensor names in the authors' files
 REGRESSION, DIFFUSION = oft.HEAD + "model.", oft.HEAD + "noise_predictor.mlp_resnet."
-STOP_TOKEN = 2  # a literal, whatever config.json says of the end of an answer
-MAX_ALPHA = 16  # of LoRA: alpha is the rank, at most this
-# Of DDIMScheduler, by its defaults and a literal of the action head.
+STOP_TOKEN = 2  # a literal of the reference, which ignores the stop token in config.json
+MAX_ALPHA = 16  # LoRA's alpha is the rank, at most this
+# DDIMScheduler's settings: its defaults and a literal of the action head.
 SCHEDULE = dict(beta_schedule="squaredcos_cap_v2", beta_start=0.0001, beta_end=0.02, predicts="noise", clip=1.0)
 
 
@@ -35,12 +35,12 @@ class Sizes(openvla.Sizes):
     d_state: int = 0
     horizon: int = 0
     has_film: bool = False
-    n_train_step: int = 0  # of a diffusion head
+    n_train_step: int = 0  # training steps of a diffusion head; 0: another head
     n_step: int = 1
 
 
 def read_sizes(checkpoint: Checkpoint, problems: Problems) -> Sizes:
-    """But for what no file states."""
+    """The sizes that files state."""
     s = Sizes(**vars(openvla.read_sizes(checkpoint, problems)))
     s.stop_token = STOP_TOKEN
     s.has_film = DINO + "blocks.0.scale.weight" in checkpoint.tensors
@@ -69,7 +69,7 @@ def network_keys(s: Sizes) -> List[Key]:
 
 
 def weights(s: Sizes, pixels: Tuple[Dict[str, tuple], Dict[str, tuple]]) -> Rows:
-    """`pixels`: mean and std of what each tower reads."""
+    """Rows of all tensors. `pixels`: mean and std of each tower's pixels."""
     d = s.lm.d_model
     return [
         *openvla.image_weights(s, pixels),
@@ -91,7 +91,7 @@ def _film(s: Sizes) -> Rows:
 
 
 def _film_of(target: str, source: str, d: int, d_text: int) -> Rows:
-    """The factor of a feature is 1 + scale."""
+    """The layers of FiLM. The factor of a feature is 1 + scale."""
     rows = linear(target + "film_scale", source + "scale", d, d_text) + linear(target + "film_shift", source + "shift", d, d_text)
     rows[1] = rows[1]._replace(plus_one=True)
     return oft.in_bf16(rows)
@@ -106,8 +106,8 @@ def dropped(s: Sizes) -> List[Dropped]:
 
 
 def put_film(tensors: Tensors, problems: Problems) -> None:
-    """Where there is a file of the towers with FiLM, they take the place of those beside the language model, which were saved without. It keeps
-    the LoRA that they were trained with apart; their evaluation rounds everything in it to bfloat16."""
+    """If there is a file of towers with FiLM, its towers replace those beside the language model, which were saved without FiLM. The file has
+    unmerged LoRA, which is merged here; the authors' evaluation rounds everything in the file to bfloat16."""
     stored, own = tensors[0], VISION + VISION
     found = {name: stored.pop(name) for name in list(stored) if name.startswith(own)}
     if not found:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""π0: PaliGemma prefix, joint-attention action expert, the state as a token of its own.
+"""π0: PaliGemma prefix, an action expert with joint attention, and the state as a separate token.
 
 Reference: lerobot src/lerobot/policies/pi0 and openpi src/openpi/models_pytorch; π0.5 (pi05.py) has the same plan.
 """
@@ -50,7 +50,7 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
 
 
 def _check_newline(text: List[dict], tokenizer: TokenizerPlan, problems: Problems) -> None:
-    """openpi encodes the newline apart from the text. The same ids come out of both together unless a token spans them."""
+    """Checks that no token spans text and newline: openpi encodes the final newline separately, the runtime together with the text."""
     if not any(op["op"] == "ensure_suffix" for op in text):
         return
     spanning = next((token for token in tokenizer.tokens if token.endswith("\n") and token.strip("\n")), None)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""π0 and π0.5 as openpi's JAX code saves them: arrays of all layers together under params/, with LoRA beside those that it was trained for.
+"""π0 and π0.5 in the layout of openpi's JAX code: under params/, each array stacks all layers; LoRA arrays are beside the arrays that they adapt.
 
-Reference: openpi examples/convert_jax_model_to_pytorch.py (names and axes), models/gemma.py (get_config), models/lora.py: attention adds
-scale (x A) B with A and B of each head, but for the last product B summed over the heads; feed-forward layers add (x A) B. The scale is
-alpha / rank, which is 1 in both configurations. Sums are made in float64 and rounded once.
+Reference: openpi examples/convert_jax_model_to_pytorch.py (names and axes), models/gemma.py (get_config), models/lora.py. Attention adds
+scale (x A) B with A and B per head, except in the last product, where B is summed over the heads; feed-forward layers add (x A) B. The scale
+is alpha / rank, which is 1 in both configurations. Sums are computed in float64 and rounded once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def is_jax(folder: str) -> bool:
 
 
 class Axes(NamedTuple):
-    """From an array of one layer to a tensor."""
+    """The conversion of one layer's array to a tensor: of the values (`turn`) and of the shape."""
 
     turn: Callable[[np.ndarray], np.ndarray]
     shape: Callable[[Shape], Shape]
@@ -43,7 +43,7 @@ BY_HEAD = Axes(lambda x: x.transpose(0, 2, 1).reshape(-1, x.shape[1]), lambda s:
 PATCH = Axes(lambda x: x.transpose(3, 2, 0, 1), lambda s: (s[3], s[2], s[0], s[1]))
 FIRST = Axes(lambda x: x[0], lambda s: s[1:])  # (1, patch, d)
 
-# Array -> tensor of a layer. `{}`: the layer.
+# Array -> tensor of a layer. `{}`: the layer's number.
 TOWER = "PaliGemma/img/Transformer/encoderblock/"
 ATTENTION = TOWER + "MultiHeadDotProductAttention_0/"
 TOWER_LAYERS = [
@@ -65,12 +65,12 @@ SINGLE = [
     ("PaliGemma/img/head/bias", PROJECTOR + ".bias", SAME),
     ("PaliGemma/llm/embedder/input_embedding", LM + "embed_tokens.weight", SAME),
 ]
-# LoRA's rank where the configuration gemma_2b_lora, or gemma_300m_lora, trains it: with it alpha, which no file states.
+# LoRA's rank in the configurations gemma_2b_lora and gemma_300m_lora; it implies alpha, which no file states.
 RANKS = {"": 16, "_1": 32}
 
 
 class Reader:
-    """Takes arrays by name, so that what is left over is known."""
+    """Takes arrays by name, so that unread arrays are known in the end."""
 
     def __init__(self, folder: str, problems: Problems) -> None:
         self.path, self.problems = os.path.join(folder, PARAMS), problems
@@ -91,7 +91,7 @@ class Reader:
 
 
 def _plain(arrays: Dict[str, Stored]) -> Dict[str, Stored]:
-    """Without `params` in front and `value` behind, which flax adds where it saved a State."""
+    """The arrays without the prefix `params` and the suffix `value`, which flax adds when it saves a State."""
     names = {name: name.split("/") for name in arrays}
     first = 1 if all(parts[0] == "params" for parts in names.values()) else 0
     last = -1 if all(parts[-1] == "value" for parts in names.values()) else None
@@ -103,7 +103,7 @@ def read_jax(folder: str, problems: Problems):
     reader = Reader(folder, problems)
     for name, tensor, axes in SINGLE:
         array = reader.take(name)
-        if axes is SAME and len(array.shape) == 2:  # the table: by rows, since it is large
+        if axes is SAME and len(array.shape) == 2:  # the token table, which is read by rows, since it is large
             read = lambda first, count, array=array: array.read(slice(first, first + count))  # noqa: E731
             reader.tensors[tensor] = Computed(tensor, reader.path, array.shape, array.dtype, read, by_rows=True)
         else:
@@ -122,7 +122,7 @@ def read_jax(folder: str, problems: Problems):
 
 
 def _heads(reader: Reader) -> None:
-    """The linear layers outside the towers, of which π0 has others than π0.5."""
+    """The linear layers outside the towers, which differ between π0 and π0.5."""
     for name in sorted(reader.arrays):
         layer, _, part = name.rpartition("/")
         if "/" in layer or part not in ("kernel", "bias"):
@@ -133,7 +133,7 @@ def _heads(reader: Reader) -> None:
 
 
 def _decoder(reader: Reader, which: str, to: str) -> None:
-    """`which`: "" for the language model, "_1" for the expert, behind the names of the modules."""
+    """The layers of a decoder. `which`: suffix of the module names, "" for the language model and "_1" for the expert."""
     layers = "PaliGemma/llm/layers/"
     for module, tensor in (("q", "q"), ("attn_vec", "o")):
         _attention(reader, "{}attn/{}_einsum{}".format(layers, module, which), which, to, "self_attn.{}_proj.weight".format(tensor))
@@ -153,7 +153,7 @@ def _decoder(reader: Reader, which: str, to: str) -> None:
 
 
 def _norm(reader: Reader, name: str, layer, single: str = "") -> None:
-    """A norm's weights, or the dense layer that computes them from the time (π0.5's expert)."""
+    """A norm's weights, or in π0.5's expert the dense layer that computes them from the time."""
     parts = [("scale", "weight", SAME)]
     if name + "/Dense_0/kernel" in reader.arrays:
         parts = [("Dense_0/kernel", "dense.weight", TURNED), ("Dense_0/bias", "dense.bias", SAME)]
@@ -168,7 +168,7 @@ def _norm(reader: Reader, name: str, layer, single: str = "") -> None:
 
 
 def _factors(reader: Reader, name: str, which: str) -> List[Stored]:
-    """LoRA's two arrays, or none."""
+    """LoRA's two arrays; empty if there are none."""
     if name + "lora_a" not in reader.arrays and name + "lora_b" not in reader.arrays:
         return []
     left, right = reader.take(name + "lora_a"), reader.take(name + "lora_b")

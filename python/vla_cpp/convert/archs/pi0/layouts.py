@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The two layouts of π0 and π0.5.
 
-π0 and π0.5 as LeRobot saves them: config.json and the two processor pipelines.
+LeRobot's layout: config.json and the two processor pipelines.
 
-Reference: lerobot src/lerobot/policies/{pi0,pi05}/{configuration,processor,modeling}_*.py. An absent key means the default of the
-reference's own class, which is stated here beside the key.
+Reference: lerobot src/lerobot/policies/{pi0,pi05}/{configuration,processor,modeling}_*.py. An absent key has the default of the
+reference's own class, listed here with the key.
 
-π0 and π0.5 as openpi saves them: weights, of its PyTorch code or of its JAX code (jax_layout.py), and statistics under assets/. Everything else about a robot stands in
-openpi's own training configurations, so those with a published recipe stand here, by their names.
+openpi's layout: weights, from its PyTorch code or from its JAX code (jax_layout.py), and statistics under assets/. openpi's training
+configurations define everything else about a robot, so this module has those with a published recipe, by name.
 
 Reference: openpi src/openpi/training/config.py, policies/{aloha,droid,libero}_policy.py, transforms.py, models/tokenizer.py.
 """
@@ -34,12 +34,12 @@ from .mapping import Family, Sizes, check_image, read_towers
 
 
 class Source(NamedTuple):
-    """What the layout of the checkpoint contributes: sizes, recipe, features, statistics."""
+    """The results of reading a layout: sizes, recipe, features, statistics."""
 
     sizes: Sizes
-    processors: recipe.Processors  # empty for openpi, which has none
+    processors: recipe.Processors  # empty for openpi, which has no processors
     image: List[dict]
-    text: List[dict]  # without the last op
+    text: List[dict]  # the text ops except the last one
     state: List[dict]
     action: List[dict]
     features: List[Key]
@@ -70,14 +70,14 @@ LEROBOT_FIXED = {
     "use_visual_memory": (False, "the runtime keeps no memory of frames"),
     "use_proprioceptive_memory": (False, "the runtime keeps no memory of states"),
 }
-# Keys that no number of an action chunk depends on.
+# Keys without effect on the numbers of an action chunk.
 LEROBOT_IGNORED = set(
     """
     tokenizer_max_length time_sampling_beta_alpha time_sampling_beta_beta time_sampling_scale time_sampling_offset
     freeze_vision_encoder train_expert_only gradient_checkpointing rtc_training_max_delay
     """.split()
 )
-# Of the class before, which had no processor files.
+# Keys of LeRobot's first PI0Config, which had no processor files.
 OLDER = set("proj_width attention_implementation num_steps resize_imgs_with_padding adapt_to_pi_aloha train_state_proj".split())
 STEPS: recipe.Steps = {
     recipe.PRE: {
@@ -96,7 +96,7 @@ def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, probl
     _refuse_older(checkpoint)
     policy = Section("config.json", checkpoint.config, LEROBOT_CONFIG, problems)
     no_position_rule(policy, options, problems)
-    memory = {key for key in policy.values if key.startswith("memory_")}  # of the two kinds that LEROBOT_FIXED refuses
+    memory = {key for key in policy.values if key.startswith("memory_")}  # settings of the two kinds of memory that LEROBOT_FIXED refuses
     check_keys(policy, family.config_class, set(LEROBOT_CONFIG) | LEROBOT_IGNORED | memory, LEROBOT_FIXED)
     sizes = read_towers(policy, checkpoint, problems)
     check_image(policy, "image_resolution", sizes, policy.get("image_resolution"))
@@ -133,7 +133,7 @@ def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, probl
 
 
 def _refuse_older(checkpoint: Checkpoint) -> None:
-    """Errors: unsupported, for a policy of LeRobot's first PI0Config, whose network had another arithmetic."""
+    """Refuses a policy of LeRobot's first PI0Config, whose network had other arithmetic. Errors: unsupported."""
     found = sorted(OLDER & set(checkpoint.config))
     if found and checkpoint.processors is None:
         hint = "today's LeRobot cannot load it either: LeRobot 0.3.3 serves it, or fine-tune today's base, lerobot/pi0_base"
@@ -142,7 +142,7 @@ def _refuse_older(checkpoint: Checkpoint) -> None:
 
 
 def _read_policy(family: Family, policy: Section, checkpoint: Checkpoint, options: Options, s: Sizes) -> None:
-    """A state or an action that the config does not list has the padded width (PI0Config.validate_features)."""
+    """Reads the policy's sizes. A state or action that the config does not list has the padded width (PI0Config.validate_features)."""
     d_state, s.d_action = policy.count("max_state_dim"), policy.count("max_action_dim")
     s.state_dim, s.action_dim = d_state, s.d_action
     if recipe.STATE in (policy.get("input_features") or {}):
@@ -188,10 +188,10 @@ def _action(s: Sizes, processors: recipe.Processors) -> List[dict]:
 # --- openpi's layout -------------------------------------------------------------------------------------------------------------------
 
 STATS_FILE = "norm_stats.json"
-SIDE = 224  # every configuration resizes to this (ModelTransformFactory)
+SIDE = 224  # every configuration resizes images to this side (ModelTransformFactory)
 EPS = 1e-6
 NEWLINE = {"op": "ensure_suffix", "suffix": "\n"}
-# config.json, where openpi's converter from JAX wrote one. The defaults of models/pi0_config.py.
+# Keys of config.json, if openpi's converter from JAX wrote one, with the defaults of models/pi0_config.py.
 OPENPI_CONFIG: Dict[str, object] = {
     "action_dim": 32,
     "paligemma_variant": "gemma_2b",
@@ -201,16 +201,16 @@ OPENPI_CONFIG: Dict[str, object] = {
 
 
 class Robot(NamedTuple):
-    """What a client sends and receives. Views: name, the name in openpi's observations, whether it may stay away unmentioned."""
+    """A robot's inputs and outputs. views: (name, name in openpi's observations, whether an act may leave it out)."""
 
     views: Sequence[Tuple[str, str, bool]]
     states: Sequence[Tuple[str, int]]
     n_action: int
-    decode: Sequence[dict] = ()  # the state into the network's conventions, before normalization
-    encode: Sequence[dict] = ()  # actions back into the robot's, at the end
+    decode: Sequence[dict] = ()  # ops that convert the state to the network's conventions, before normalization
+    encode: Sequence[dict] = ()  # ops that convert actions to the robot's conventions, at the end
 
 
-# aloha_policy.py: four joints turn the other way, and grippers travel in metres outside and in turns of a servo inside.
+# aloha_policy.py: four joints have the opposite sign; gripper values are metres for the robot and servo angles for the network.
 FLIP = {"op": "affine", "columns": [1, 2, 8, 9], "scale": -1.0, "shift": 0.0}
 GRIPPERS = [6, 13]
 ALOHA_VIEWS = (("cam_high", "", False), ("cam_left_wrist", "", True), ("cam_right_wrist", "", True))
@@ -237,20 +237,20 @@ LIBERO = Robot(
     views=(("image", "observation/image", False), ("wrist_image", "observation/wrist_image", False)), states=(("state", 8),), n_action=7
 )
 ROBOTS = {"aloha": ALOHA, "droid": DROID, "libero": LIBERO}
-# Joints that actions are relative to; grippers are absolute (make_bool_mask).
+# Columns of relative actions, the joints; grippers are absolute (make_bool_mask).
 ALOHA_JOINTS = [*range(6), *range(7, 13)]
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One TrainConfig, as far as inference depends on it."""
+    """The part of a TrainConfig that affects inference."""
 
     arch: str
     robot: Robot
     asset: str
     horizon: int = 50
     relative: Sequence[int] = ()
-    discrete_state: bool = True  # of pi05: discrete_state_input
+    discrete_state: bool = True  # discrete_state_input, only for pi05
 
 
 LIBERO_ASSET = "physical-intelligence/libero"
@@ -262,7 +262,7 @@ VARIANTS = {
     "pi0_aloha_sim": Variant("pi0", ALOHA, "lerobot/aloha_sim_transfer_cube_human"),
     "pi0_droid": Variant("pi0", DROID, "droid", horizon=10),
     "pi0_libero": Variant("pi0", LIBERO, LIBERO_ASSET, relative=range(6)),
-    "pi0_libero_low_mem_finetune": Variant("pi0", LIBERO, LIBERO_ASSET, relative=range(6)),  # with LoRA
+    "pi0_libero_low_mem_finetune": Variant("pi0", LIBERO, LIBERO_ASSET, relative=range(6)),  # trained with LoRA
     "pi05_aloha": Variant("pi05", ALOHA, "trossen", relative=ALOHA_JOINTS),
     "pi05_aloha_pen_uncap": Variant("pi05", ALOHA, "trossen", relative=ALOHA_JOINTS),
     "pi05_droid": Variant("pi05", DROID, "droid", horizon=15),
@@ -277,7 +277,7 @@ def variants_of(arch: str) -> List[str]:
 
 
 def read_variant(checkpoint: Checkpoint, name: str) -> Variant:
-    """The configuration of that name, or that a JSON file states, which lies there or in the checkpoint."""
+    """The configuration of that name, or in the JSON file of that path or of that name in the checkpoint."""
     if name in VARIANTS:
         return VARIANTS[name]
     path = name if os.path.exists(name) else checkpoint.path(name)
@@ -318,7 +318,7 @@ def _own_robot(given: Section) -> Robot:
     return Robot([(view, alias, False) for view, alias in views.items()], list(states.items()), n_action)
 
 
-# A TrainConfig of one's own: for a robot of openpi, or for one whose transforms do no more than name, normalize and make relative.
+# Keys of a user's own TrainConfig, for one of openpi's robots, or for a robot whose transforms only name, normalize and make relative.
 VARIANT_FILE: Dict[str, object] = {
     "model": "",
     "robot": "",
@@ -330,11 +330,11 @@ VARIANT_FILE: Dict[str, object] = {
     "discrete_state": True,
     "assets": "",
 }
-MAX_VIEWS = 3  # of openpi's models
+MAX_VIEWS = 3  # views of openpi's models
 
 
 def _names(value: object, kind: type) -> bool:
-    """Whether it has names for values of that kind, widths greater than zero."""
+    """Whether `value` is a non-empty dict with values of that type; numbers must be above 0."""
     if not isinstance(value, dict) or not value:
         return False
     return all(key and isinstance(x, kind) and not isinstance(x, bool) and (kind is str or x > 0) for key, x in value.items())
@@ -395,14 +395,14 @@ def _openpi_sizes(family: Family, policy: Section, checkpoint: Checkpoint, varia
         policy.bad("action_dim", "at least the robot's {} numbers".format(max(s.state_dim, s.action_dim)))
     s.horizon, s.n_step = policy.count("action_horizon"), 10
     s.min_period, s.max_period = 4e-3, 4.0
-    s.solver = "euler_float32"  # sample_actions adds up time in a tensor of float32
+    s.solver = "euler_float32"  # sample_actions accumulates time in a float32 tensor
     if policy.get("precision") not in ("bfloat16", "float32", "float16"):
         policy.bad("precision", "bfloat16, float32 or float16", unsupported=True)
     return s
 
 
 def _statistics(family: Family, checkpoint: Checkpoint, variant: Variant, problems: Problems) -> Dict[str, np.ndarray]:
-    """By the name of the bundle's tensor, cut to the robot's widths (the files pad them). They are doubles in the file."""
+    """The statistics by the name of the bundle's tensor, without the padding that the files add to the robot's widths. The file has doubles."""
     path = os.path.join(checkpoint.path("assets"), *variant.asset.split("/"), STATS_FILE)
     where = os.path.relpath(path, checkpoint.folder)
     if not os.path.exists(path):
@@ -442,7 +442,7 @@ def _values(stats: dict, key: str, name: str, width: int, where: str, problems: 
         found = "none" + there if values is None else "{} numbers".format(len(values)) if numbers else repr(values)[:80]
         problems.add(place, "{} numbers".format(width), found, "compute the data set's statistics again with openpi's script")
         return np.zeros(width, np.float32)
-    with np.errstate(over="ignore"):  # told below
+    with np.errstate(over="ignore"):  # reported below
         chosen = np.asarray(values[:width], np.float32)
     if not np.isfinite(chosen).all():
         problems.add(place, "finite numbers", str(chosen[~np.isfinite(chosen)][0]))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sizes of π0 and π0.5, and the names, storage and shapes of their tensors.
 
-Its configuration knows two sizes by name; a `dims.json` beside it states others.
+The reference's config names one of two sizes; a `dims.json` beside it states others.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from .. import Dropped, Weight
 
 
 class Family(NamedTuple):
-    """In what the two differ."""
+    """The differences between π0 and π0.5."""
 
     arch: str
     config_class: str
-    max_tokens: int  # what openpi's configurations allow; LeRobot's pipelines state it
-    time_mlp: str  # the tensors of the time layers
-    other_time_mlp: str  # what the other family calls them
+    max_tokens: int  # limit in openpi's configurations; LeRobot's pipelines state their own
+    time_mlp: str  # name of the time layers
+    other_time_mlp: str  # name of the time layers in the other family
 
     @property
     def state_token(self) -> bool:
-        """π0 has the state as a token; π0.5 has it in the prompt and time in its norms."""
+        """Whether the state is a token, as in π0. In π0.5 the state is in the prompt and the time enters through norms."""
         return self.arch == "pi0"
 
 
 DIMS_FILE = "dims.json"
-# lerobot modeling_pi0.py (get_gemma_config) and openpi models/gemma.py (get_config).
+# Sizes in lerobot modeling_pi0.py (get_gemma_config) and openpi models/gemma.py (get_config).
 VARIANTS = {
     "gemma_2b": dict(width=2048, depth=18, mlp_dim=16384, num_heads=8, num_kv_heads=1, head_dim=256),
     "gemma_300m": dict(width=1024, depth=18, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=256),
 }
-# SigLIP-So400m/14 as PaliGemma's config and modeling_pi0.py (PaliGemmaWithExpertModel) have it.
+# SigLIP-So400m/14, as in PaliGemma's config and modeling_pi0.py (PaliGemmaWithExpertModel).
 SIGLIP = defaults(1152, 4304, 27, 16, patch_size=14, image_size=0)
 N_VOCAB = 257152
-EPS, ROPE_BASE = 1e-6, 10000.0  # of both Gemma configs and of the tower, which state no others
+EPS, ROPE_BASE = 1e-6, 10000.0  # fixed for both Gemmas and the tower: no config states other values
 
 
 @dataclass
@@ -55,9 +55,9 @@ class Sizes:
     lm: Language = field(default_factory=Language)
     d_expert: int = 0
     d_expert_ff: int = 0
-    state_dim: int = 0  # of the robot
+    state_dim: int = 0  # the robot's widths
     action_dim: int = 0
-    d_state: int = 0  # of the network
+    d_state: int = 0  # the network's widths
     d_action: int = 0
     horizon: int = 0
     n_step: int = 0
@@ -67,7 +67,7 @@ class Sizes:
 
 
 def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> Sizes:
-    """The sizes of the three towers; `policy` names the variants of two."""
+    """The sizes of the vision tower, the language model and the expert; `policy` names the variants of the last two."""
     dims = _dims(checkpoint, problems)
     lm, expert = (_gemma(policy, key, dims, checkpoint, problems) for key in ("paligemma_variant", "action_expert_variant"))
     for key in ("depth", "num_heads", "num_kv_heads", "head_dim"):
@@ -81,7 +81,7 @@ def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> 
 
 
 def read_paligemma(policy: Section, checkpoint: Checkpoint, problems: Problems) -> Sizes:
-    """The same without an expert."""
+    """The sizes of the vision tower and the language model, for a policy without an expert."""
     dims = _dims(checkpoint, problems)
     return _paligemma(dims, _gemma(policy, "paligemma_variant", dims, checkpoint, problems), problems)
 
@@ -112,7 +112,7 @@ def _paligemma(dims: dict, lm: Section, problems: Problems) -> Sizes:
 
 
 def check_image(policy: Section, key: str, sizes: Sizes, resolution) -> None:
-    """Sets the size of the images, which the reference wants square."""
+    """Sets the size of the images, which must be square as in the reference."""
     square = isinstance(resolution, list) and len(resolution) == 2 and resolution[0] == resolution[1]
     side = resolution[0] if square else 0
     if type(side) is not int or not sizes.vision.patch_size <= side <= 8192:
@@ -166,8 +166,8 @@ def network_keys(s: Sizes) -> List[Key]:
     )
 
 
-# --- names. Releases of LeRobot, openpi and transformers moved the towers about and left prefixes out; a mapping needs one name for each
-# tensor, and that is LeRobot's of today. Reference: lerobot policies/pi0/modeling_pi0.py (_fix_pytorch_state_dict_keys, from_pretrained).
+# --- names. Releases of LeRobot, openpi and transformers use different prefixes of the towers. A mapping needs one name per tensor: the name in
+# LeRobot's current release. Reference: lerobot policies/pi0/modeling_pi0.py (_fix_pytorch_state_dict_keys, from_pretrained).
 
 ROOT = "model."
 TOWERS = ROOT + "paligemma_with_expert."
@@ -179,7 +179,7 @@ EMBEDDING = LM + "embed_tokens.weight"
 LM_HEAD = PALIGEMMA + "lm_head.weight"
 EXPERT = TOWERS + "gemma_expert.model."
 EXPERT_HEAD = TOWERS + "gemma_expert.lm_head.weight"
-# A prefix of another tree and what it is today. The first that fits counts.
+# Prefix in another release -> current prefix. The first match applies.
 MOVED = (
     (PALIGEMMA + "language_model.lm_head.", PALIGEMMA + "lm_head."),
     (PALIGEMMA + "language_model.model.", LM),
@@ -190,7 +190,7 @@ MOVED = (
 
 
 def canonical(name: str, time_mlp: str, other_time_mlp: str) -> str:
-    """Today's name. `time_mlp`: the family's word for its time layers, for which files may have the other family's."""
+    """The current name of a tensor. `time_mlp`: the family's name of its time layers; files may have the other family's name."""
     if not name.startswith(ROOT):
         name = ROOT + name
     for old, new in MOVED:
@@ -226,13 +226,13 @@ def rename(tensors: Dict[str, Entry], time_mlp: str, other_time_mlp: str, notes:
 
 
 def rounded(weight: Weight) -> bool:
-    """What LeRobot rounds in bfloat16: neither the vision tower nor norms, nor the projections outside the towers
+    """Whether LeRobot rounds this weight in a bfloat16 policy: all except the vision tower, norms, and the projections outside the towers
     (to_bfloat16_for_selected_params)."""
     return weight.target.startswith(("lm.", "expert.blk.")) and ".dense." not in weight.target
 
 
 def paligemma(s: Sizes, checkpoint: Checkpoint, end: str) -> Rows:
-    """`end`: as of networks.decoder."""
+    """Rows of PaliGemma. `end`: as in networks.decoder."""
     return [
         *siglip(VISION, s.vision),
         *linear("projector", PROJECTOR, s.lm.d_model, s.vision.d_model),
@@ -274,7 +274,7 @@ def dropped(family: Family, s: Sizes, checkpoint: Checkpoint) -> List[Dropped]:
     ]
     if family.state_token:
         return rows
-    # The reference's loader passes these over in a checkpoint of π0.5.
+    # The reference's loader ignores these tensors in a checkpoint of π0.5.
     reason = "π0.5 has its state in the prompt and its norms without weights of their own"
     norms = ["{}layers.{}.{}.weight".format(EXPERT, i, n) for i in range(s.lm.n_layer) for n in NORMS]
     rows += [Dropped(name, (s.d_expert,), reason) for name in [*norms, EXPERT + "norm.weight"]]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""SmolVLA: what its checkpoint states, as keys and tensors of a bundle.
+"""Converts checkpoints of SmolVLA to keys and tensors of a bundle.
 
 Reference: lerobot src/lerobot/policies/smolvla (configuration_smolvla.py, smolvlm_with_expert.py, modeling_smolvla.py) and
 transformers models/smolvlm. Shapes come from the configs alone; a tensor of another shape is refused, not adopted.
@@ -30,7 +30,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
     folder = tokenizer_folder(checkpoint, options, processors) or sizes.backbone
     tokenizer = read_tokenizer(folder, sizes.lm.n_vocab, problems, checkpoint.notes)
-    # One view is enough: the reference (prepare_images) drops every view that is missing, or masks it, which is the same.
+    # One view suffices: the reference (prepare_images) drops or masks missing views, which is equivalent.
     views = view_keys(checkpoint, sizes.views, processors, problems)
     keys = [
         *network_keys(sizes),

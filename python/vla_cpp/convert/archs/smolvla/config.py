@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of a SmolVLA policy from its config.json and its backbone's, and everything in them that the runtime cannot honour.
+"""Sizes of a SmolVLA policy from its config.json and its backbone's, with refusals of everything that the runtime does not support.
 
-An absent key means the default of the reference's own class, which is stated here beside the key.
+An absent key has the default of the reference's own class, listed here with the key.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ...section import ANY_INT, Section
 from .. import Options
 
 BACKBONE = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
-# SmolVLAConfig's keys that numbers depend on, with the defaults of the class.
+# SmolVLAConfig keys with effect on numbers, with the class's defaults.
 POLICY = {
     "chunk_size": 50,
     "n_action_steps": 50,
@@ -41,22 +41,22 @@ POLICY = {
     "min_period": 4e-3,
     "max_period": 4.0,
 }
-# Keys whose other values ask for something that the runtime does not do.
+# Keys with the only value that the runtime supports, and the reason.
 FIXED = {
     "adapt_to_pi_aloha": (False, "joint flips and gripper maps of that robot are not in the recipe"),
     "use_delta_joint_actions_aloha": (False, "the reference refuses it too"),
     "use_cache": (True, "the reference cannot take steps without its cache"),
     "add_image_special_tokens": (False, "the prefix would hold further tokens"),
 }
-# Keys that no number of an action chunk depends on, beside those of every policy of LeRobot.
+# Keys without effect on the numbers of an action chunk, beside those of every LeRobot policy.
 IGNORED = set("pad_language_to freeze_vision_encoder train_expert_only train_state_proj".split())
-# SmolVLMVisionConfig and LlamaConfig, with the defaults of the classes. Keys that they do not read stay without effect there too.
+# SmolVLMVisionConfig and LlamaConfig, with the classes' defaults. Keys that they do not read have no effect in the reference either.
 VISION = defaults(1152, 3072, 12, 16, image_size=224, patch_size=32, layer_norm_eps=1e-6)
 TEXT = defaults(4096, 11008, 32, 32, vocab_size=32000, rms_norm_eps=1e-6)
 VISION_FIXED = {"hidden_act": "gelu_pytorch_tanh", "num_channels": 3}
 TEXT_FIXED = {"hidden_act": "silu", "attention_bias": False, "mlp_bias": False, "model_type": "llama"}
 TEXT_NULLABLE = ("num_key_value_heads", "head_dim")
-ROPE_BASE = 10000.0  # whatever the backbone's config says: the reference rotates with its own function (apply_rope)
+ROPE_BASE = 10000.0  # not from the backbone's config: the reference has its own function (apply_rope)
 
 
 @dataclass
@@ -81,7 +81,7 @@ class Sizes:
     d_expert_ff: int = 0
     n_expert_layer: int = 0
     layer_kinds: Sequence[str] = ()
-    d_kv_in: Sequence[int] = ()  # per expert layer: input width of its k and v projections
+    d_kv_in: Sequence[int] = ()  # per expert layer: input width of the k and v projections
 
 
 def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> Sizes:
@@ -159,8 +159,8 @@ def _read_vision(vision: Section, backbone: Section, s: Sizes) -> None:
 
 
 def _position_precision(policy: Section, vision: Section, options: Options, checkpoint: Checkpoint) -> str:
-    """The reference computes position rows in the precision of the pixels, which is the tower's: bfloat16 when the policy loads
-    the backbone's weights (from_pretrained with torch_dtype bfloat16) or when vision_config says so (_from_config), else float32."""
+    """The precision of the position rows. The reference uses the precision of the pixels, which is the tower's: bfloat16 if the policy loads
+    the backbone's weights (from_pretrained with torch_dtype bfloat16) or if vision_config says so (_from_config), else float32."""
     if options.position_precision:
         return options.position_precision
     stated = vision.get("dtype") or vision.get("torch_dtype")
@@ -185,18 +185,18 @@ def _position_precision(policy: Section, vision: Section, options: Options, chec
 
 
 def expert_ff(d_model: int) -> int:
-    """Width of the expert's MLP: four thirds of twice the width, cut to whole numbers and raised to a multiple of 256
-    (smolvlm_with_expert.py: get_intermediate_size)."""
+    """Width of the expert's MLP: 4 * floor(2 * d_model / 3), rounded up to a multiple of 256 (smolvlm_with_expert.py:
+    get_intermediate_size)."""
     return 256 * ((4 * int(2 * d_model / 3) + 255) // 256)
 
 
 def is_cross(i_layer: int, mode: str, every: int) -> bool:
-    """Whether the reference gives this index cross-attention; it asks with two kinds of index, see below."""
+    """Whether a layer has cross-attention. The reference calls this with two kinds of index, see `_check_expert_layers`."""
     return "cross" in mode and not (every > 0 and i_layer % every == 0)
 
 
 def layer_kinds(n_layer: int, n_expert: int, mode: str, every: int) -> List[str]:
-    """What the reference does in each language-model layer during a step (get_model_layers, forward)."""
+    """The expert's attention in each language-model layer during a solver step: "cross", "self" or "none" (get_model_layers, forward)."""
     ratio = n_layer // n_expert
     return ["none" if i % ratio else "cross" if is_cross(i, mode, every) else "self" for i in range(n_layer)]
 
@@ -225,8 +225,8 @@ def read_expert(policy: Section, s: Sizes) -> None:
 
 
 def _check_expert_layers(policy: Section, s: Sizes, mode: str, every: int) -> None:
-    """The reference counts in expert layers when it builds k and v, and in language-model layers when it runs them, so with
-    fewer expert layers the two can disagree; it also cannot run self-attention where the expert has no layer."""
+    """Refuses layers that the reference cannot run. It uses indices of expert layers to build k and v, but of language-model layers to run
+    them, so with fewer expert layers the two can disagree. It also cannot run self-attention in a layer without an expert layer."""
     d_kv, ratio = s.lm.heads[1], s.lm.n_layer // s.n_expert_layer
     s.d_kv_in = [d_kv if is_cross(j, mode, every) else s.d_expert for j in range(s.n_expert_layer)]
     for i, kind in enumerate(s.layer_kinds):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""TurboVLA: what its checkpoint states, as keys and tensors of a bundle.
+"""Converts checkpoints of TurboVLA to keys and tensors of a bundle.
 
 Reference: lerobot_policy_turbovla (configuration_turbovla.py, modeling_turbovla.py, vl_interaction.py, action_decoder.py,
 processor_turbovla.py) and transformers models/dinov3_vit and models/bert.

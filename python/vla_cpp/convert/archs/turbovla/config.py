@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of a TurboVLA policy from its config.json and those of its backbones, and everything in them that the runtime cannot honour.
+"""Sizes of a TurboVLA policy from its config.json and those of its backbones, with refusals of everything that the runtime does not support.
 
-An absent key means the default of the reference's own class, which is stated here beside the key. A checkpoint has the weights of
-both backbones but not their configs: the language model's come with its tokenizer, and those of DINOv3's releases stand here.
+An absent key has the default of the reference's own class, listed here with the key. A checkpoint has the weights of
+both backbones but not their configs: the language model's comes with its tokenizer, and this module has those of DINOv3's releases.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ...recipe import STATE
 from ...section import Section
 from .. import Options
 
-# TurboVLAConfig's keys that numbers depend on, with the defaults of the class.
+# TurboVLAConfig keys with effect on numbers, with the class's defaults.
 POLICY = {
     "chunk_size": 12,
     "n_action_steps": 12,
@@ -36,24 +36,24 @@ POLICY = {
     "n_fusion_layers": 6,
     "n_decoder_layers": 4,
 }
-# Keys that no number of an action chunk depends on, beside those of every policy of LeRobot.
+# Keys without effect on the numbers of an action chunk, beside those of every LeRobot policy.
 IGNORED = set("load_pretrained_backbones freeze_vision_backbone freeze_language_backbone dropout optimizer_lr_backbone".split())
 ACTIVATIONS = {"relu": "relu", "gelu": "gelu_erf"}
-MIN_TOKENS = 3  # one word between the tokens that stand around every text
+MIN_TOKENS = 3  # one word, and the tokens before and after every text
 
 
 def release(d_model: int, n_layer: int, n_head: int) -> dict:
     return defaults(d_model, 4 * d_model, n_layer, n_head, model_type="dinov3_vit", num_register_tokens=4)
 
 
-# Configs of DINOv3's vision transformers with plain MLPs, as they are published.
+# Published configs of DINOv3's vision transformers with plain MLPs.
 DINOV3 = {
     "facebook/dinov3-vits16-pretrain-lvd1689m": release(384, 12, 6),
     "facebook/dinov3-vitb16-pretrain-lvd1689m": release(768, 12, 12),
     "facebook/dinov3-vitl16-pretrain-lvd1689m": release(1024, 24, 16),
     "facebook/dinov3-vitl16-pretrain-sat493m": release(1024, 24, 16),
 }
-# DINOv3ViTConfig and BertConfig, with the defaults of the classes. Keys that they do not read stay without effect there too.
+# DINOv3ViTConfig and BertConfig, with the classes' defaults. Keys that they do not read have no effect in the reference either.
 VISION = defaults(384, 1536, 12, 6, patch_size=16, layer_norm_eps=1e-5, rope_theta=100.0, num_register_tokens=0)
 VISION_FIXED = {
     "model_type": (None, "dinov3_vit"),
@@ -92,7 +92,7 @@ class Sizes:
     rope_base: float
     n_register: int
     lm: TextEncoder
-    n_sentence: int  # rows of the table that tells two sentences apart
+    n_sentence: int  # rows of the table of sentence types (BERT's token_type_embeddings)
     lm_folder: str
 
 
@@ -140,7 +140,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
 
 
 def _vision_config(policy: Section, checkpoint: Checkpoint) -> dict:
-    """That of a release, or of vision_encoder/ inside the checkpoint."""
+    """The vision backbone's config: that in vision_encoder/ inside the checkpoint, else that of the named release."""
     path = checkpoint.path(os.path.join("vision_encoder", "config.json"))
     if os.path.exists(path):
         checkpoint.notes.append("config of the vision backbone: from vision_encoder/ inside the checkpoint")

@@ -96,7 +96,7 @@ def _language(s: Sizes) -> Rows:
     return [
         *table("lm.token_embd", at + "word_embeddings.weight", lm.n_vocab, lm.d_model),
         *table("lm.position", at + "position_embeddings.weight", lm.n_position, lm.d_model),
-        # An instruction is the first of two sentences.
+        # An instruction has the first sentence type.
         *vector("lm.sentence.weight", at + "token_type_embeddings.weight", lm.d_model, (s.n_sentence, lm.d_model), pick=(0, 0)),
         *norm("lm.embd_norm", at + "LayerNorm", lm.d_model),
         *blocks("lm.", LANGUAGE + "encoder.layer.{}.", BERT, lm.n_layer, lm.d_model, lm.d_ff),

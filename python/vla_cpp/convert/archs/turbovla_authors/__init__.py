@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""TurboVLA as its authors save it for LIBERO: a file of torch.save with weights and model_config, and a file of statistics. (`turbovla` is
-a port by others, whose network is another.)
+"""TurboVLA in its authors' layout for LIBERO: a torch.save file with weights and model_config, and a file of statistics. (`turbovla` is a
+port by other people, with a different network.)
 
 Reference: H-EmbodVis/TurboVLA turbovla/models, turbovla/text/bert.py, turbovla/evaluation (policy.py, suite_policy.py),
 turbovla/training/trainer.py (train_model); transformers models/dinov3_vit and models/bert.
@@ -22,11 +22,11 @@ from .config import LAYOUT as LAYOUT
 from .config import Sizes, read_normalization, read_pixels, read_sizes
 from .mapping import dropped, hints, network_keys, weights
 
-# What turbovla/evaluation does with columns of state and action are literals for LIBERO's robot.
+# Literals of turbovla/evaluation for the state and action of LIBERO's robot.
 D_STATE, D_ACTION, GRIPPER = 8, 7, 6
 EPS_STATE, EPS_ACTION = 1e-6, 1e-8
-CLOSED_AT = -1.401298464324817e-45  # the float32 below zero that is nearest to it: zero opens no gripper
-ENDS = ("[CLS]", "[SEP]", ".", "?")  # of sentences
+CLOSED_AT = -1.401298464324817e-45  # the largest float32 below zero, so that exactly zero does not open the gripper
+ENDS = ("[CLS]", "[SEP]", ".", "?")  # tokens that end a sentence
 
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
@@ -55,7 +55,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def _id_of(tokenizer: TokenizerPlan, token: str) -> int:
-    """As convert_tokens_to_ids: a token that the vocabulary does not have is the unknown one."""
+    """The id of a token, or of the unknown token if the vocabulary lacks it, as in convert_tokens_to_ids."""
     tokens = next(key.value for key in tokenizer.keys if key.name == "tokenizer.tokens")
     return tokens.index(token) if token in tokens else next(key.value for key in tokenizer.keys if key.name == "tokenizer.unknown_id")
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the authors' files state: model_config inside of the weights, statistics beside them, the configs of both backbones; and everything
-in them that the runtime cannot honour.
+"""Reads the authors' files: model_config in the weights' file, statistics beside it, and the configs of both backbones. Refuses everything that
+the runtime does not support.
 
-An absent key means the default of turbovla/models/configuration.py, which is stated here beside the key.
+An absent key has the default of turbovla/models/configuration.py, listed here with the key.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from ...torch_file import read_torch, read_torch_value
 from .. import Options
 from ..turbovla.config import DINOV3, TEXT, TEXT_FIXED, VISION, VISION_FIXED, read_bert
 
-WEIGHTS = ("model_state_dict", "model", "state_dict")  # the first of them that a file has (policy.py _checkpoint_state_dict)
+WEIGHTS = ("model_state_dict", "model", "state_dict")  # the first of these keys in a file is used (policy.py _checkpoint_state_dict)
 CONFIG, STATISTICS = "model_config", "*stats*.json"
 BACKBONE = "vision_encoder.backbone."
-VIEWS, ALIASES = ("image", "image2"), ("full_image", "wrist_image")  # LeRobot's names of LIBERO's cameras, and those of its clients
-MIN_TOKENS = 2  # what stands around every text
+VIEWS, ALIASES = ("image", "image2"), ("full_image", "wrist_image")  # names of LIBERO's cameras in LeRobot and in the authors' clients
+MIN_TOKENS = 2  # the tokens before and after every text
 
 TEXT_ENCODER = {
     "model_name_or_path": "bert-base-uncased",
@@ -62,7 +62,7 @@ ACTION = {
     "state_hidden_dim": 256,
 }
 PARTS = {"text": TEXT_ENCODER, "vision": VISION_ENCODER, "interaction": INTERACTION, "action": ACTION}
-# Keys that no number of an action chunk in float32 depends on.
+# Keys without effect on the numbers of an action chunk in float32.
 IGNORED = {
     "text": set("frozen force_eval_when_frozen local_files_only attention_implementation".split()),
     "vision": set(
@@ -125,8 +125,8 @@ class Sizes:
     aliases: Sequence[str]
     vision_tokens: str
     max_tokens: int
-    n_row: int  # rows of a text, 0: as many as it has tokens
-    limits: Dict[str, int]  # by instruction
+    n_row: int  # rows to which a text is padded; 0: no padding
+    limits: Dict[str, int]  # number of tokens by instruction, for instructions with their own number
     sentences: str
     padding: str
     places: str
@@ -147,14 +147,14 @@ class Sizes:
     vision: Vision
     rope_base: float
     n_register: int
-    layers: str  # what transformers calls the list of the tower's layers
+    layers: str  # transformers' name of the list of the tower's layers
     lm: TextEncoder
     n_sentence: int
     lm_folder: str
 
     @property
     def d_projector(self) -> int:
-        """turbovla.py TurboVLA.__init__."""
+        """Width of the projector (turbovla.py TurboVLA.__init__)."""
         return max(4 * self.d_model, self.vision.d_model // 2)
 
 
@@ -214,7 +214,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
 
 
 def _read_parts(config: dict, problems: Problems) -> Dict[str, Section]:
-    for key in sorted(set(config) - set(PARTS) - {"name", "embedding_dump"}):  # the last writes what is computed to files
+    for key in sorted(set(config) - set(PARTS) - {"name", "embedding_dump"}):  # embedding_dump only writes intermediate results to files
         problems.unsupported("{}: {}".format(CONFIG, key), "a part of TurboVLAConfig", "one that this converter does not know")
     if config.get("name", "TurboVLA") != "TurboVLA":
         problems.unsupported(CONFIG + ": name", "'TurboVLA'", repr(config["name"])[:80])
@@ -241,13 +241,13 @@ def _flag(section: Section, key: str) -> bool:
 
 
 def _padding(text: Section, fusion: Section) -> str:
-    """What becomes of rows behind a text."""
+    """The treatment of padding rows after a text: "zeroed", "zeroed_first" or "kept"."""
     zeroed = _choice(fusion, "padding_strategy", {"key_padding_mask": "", "zero_fill": "zeroed"})
     return zeroed or ("zeroed_first" if _flag(text, "zero_padded_tokens") else "kept")
 
 
 def _read_padding(text: Section) -> Tuple[int, Dict[str, int]]:
-    """Rows of a text, 0 where nothing is padded, and tokens of instructions that have a number of their own."""
+    """Rows to which a text is padded, 0 without padding; and the number of tokens of instructions with their own number."""
     n_row = text.count("padding_length", MIN_TOKENS) if text.get("padding_length") is not None else 0
     limits = text.get("padding_length_by_instruction")
     if not isinstance(limits, dict):
@@ -273,7 +273,8 @@ def _views(given: Sequence[str], n_view: int, problems: Problems) -> Tuple[List[
 
 
 def _vision_config(checkpoint: Checkpoint, problems: Problems) -> dict:
-    """That of vision_encoder/ inside the checkpoint, or of the only release with this width and number of layers."""
+    """The vision backbone's config: that in vision_encoder/ inside the checkpoint, else that of the only release with this width and number of
+    layers."""
     path = checkpoint.path(os.path.join("vision_encoder", "config.json"))
     if os.path.exists(path):
         checkpoint.notes.append("config of the vision backbone: from vision_encoder/ inside the checkpoint")
@@ -306,7 +307,8 @@ def _check_sizes(s: Sizes, fusion: Section, vision: Section, dino: Section, text
 
 
 def read_pixels(checkpoint: Checkpoint, problems: Problems) -> Dict[str, object]:
-    """Of vision_encoder/preprocessor_config.json, whose defaults are ImageNet's (policy.py build_dinov3_manual_processor)."""
+    """Mean and std of pixels, from vision_encoder/preprocessor_config.json; the defaults are ImageNet's (policy.py
+    build_dinov3_manual_processor)."""
     path = checkpoint.path(os.path.join("vision_encoder", "preprocessor_config.json"))
     config = Section("preprocessor_config.json", read_json(path) if os.path.exists(path) else {}, {}, problems)
     scale = config.values.get("rescale_factor", 1 / 255)
@@ -323,7 +325,7 @@ def read_pixels(checkpoint: Checkpoint, problems: Problems) -> Dict[str, object]
 
 
 def read_normalization(checkpoint: Checkpoint, name: str, widths: Dict[str, int], problems: Problems) -> Dict[str, np.ndarray]:
-    """Of one entry of the file of statistics, in float32 (suite_policy.py _select_stats, TurboVLAPolicy.__init__)."""
+    """The statistics in one entry of the file, in float32 (suite_policy.py _select_stats, TurboVLAPolicy.__init__)."""
     path = _file(checkpoint.folder, STATISTICS, "the statistics", "put libero_all4_stats.json of the authors beside the weights")
     where, everything = os.path.basename(path), read_json(path)
     entries = [key for key in everything if key != "metadata"]
@@ -349,5 +351,5 @@ def read_normalization(checkpoint: Checkpoint, name: str, widths: Dict[str, int]
 
 def _numbers(values) -> np.ndarray:
     sound = isinstance(values, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
-    with np.errstate(over="ignore"):  # told by the caller
+    with np.errstate(over="ignore"):  # reported by the caller
         return np.asarray(values if sound else [], np.float64).astype(np.float32)

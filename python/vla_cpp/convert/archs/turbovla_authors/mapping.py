@@ -19,7 +19,7 @@ AMONG = Names("self_attn.in_proj_ self_attn.out_proj", "linear1 linear2", "norm1
 DECODED = Names(
     "self_attn.in_proj_ self_attn.out_proj", "linear1 linear2", "norm1 norm2 norm3", cross="multihead_attn.in_proj_ multihead_attn.out_proj"
 )
-# What the two sides of a fusion layer are called in it: the stream, and the suffix of its tensors.
+# The two streams of a fusion layer -> the suffix of their tensors.
 SIDES = {"image": "v", "text": "l"}
 
 
@@ -86,7 +86,7 @@ def _projector(s: Sizes) -> Rows:
 
 
 def _places(s: Sizes) -> Rows:
-    """What is added to the patches: of every view, and of every patch of it."""
+    """The embeddings that are added to the patches: one per view, and one per patch of each view."""
     d, n_view, n_patch = s.d_model, len(s.views), s.vision.n_patch
     if s.places == "views":
         return table("camera", "view_embedding", n_view, d, (1, n_view, d))
@@ -125,7 +125,7 @@ def _language(s: Sizes) -> Rows:
     return [
         *table("lm.token_embd", at + "word_embeddings.weight", lm.n_vocab, lm.d_model),
         *table("lm.position", at + "position_embeddings.weight", lm.n_position, lm.d_model),
-        # An instruction is the first of two sentences.
+        # An instruction has the first sentence type.
         *vector("lm.sentence.weight", at + "token_type_embeddings.weight", lm.d_model, (s.n_sentence, lm.d_model), pick=(0, 0)),
         *norm("lm.embd_norm", at + "LayerNorm", lm.d_model),
         *blocks("lm.", LANGUAGE + "encoder.layer.{}.", BERT, lm.n_layer, lm.d_model, lm.d_ff),

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""VLA-Adapter: OpenVLA's towers, a Qwen2.5 0.5B that reads action queries, and a head whose layers attend to its layers.
+"""VLA-Adapter: OpenVLA's towers, a Qwen2.5 0.5B that reads action queries, and a head whose layers attend to those of Qwen.
 
-A fine-tune is a folder: config.json, weights, tokenizer and processor files, dataset_statistics.json, and the action head and the proprio
-projector in a file of torch.save each, on the hub without a step in its name. The robot is a set of constants in their code, chosen by a word
-of the command line, and its grippers are those of two evaluations; no file says which.
+A fine-tune is a folder: config.json, weights, tokenizer and processor files, dataset_statistics.json, and one torch.save file each for the
+action head and the proprio projector, on the hub without a step in its name. A robot is a set of constants in the authors' code, chosen by a
+word of the command line; the authors' two evaluations treat the gripper differently. No file states the robot.
 
 Reference: OpenHelix-Team/VLA-Adapter (experiments/robot/openvla_utils.py, experiments/robot/libero/run_libero_eval.py,
 vla-scripts/{vla_evaluation,evaluate_calvin,finetune}.py, prismatic/vla/constants.py).
@@ -28,11 +28,11 @@ from .mapping import BACKBONES, dropped, network_keys, read_sizes, weights
 START, END = "<|im_start|>", "<|im_end|>"
 SYSTEM = "system\nYou are Qwen, created by Alibaba Cloud. You are a helpful assistant."
 QUESTION, ANSWER = "What action should the robot take to ", "?"
-MAX_TOKENS = 512  # of a prompt, far above any instruction: the reference cuts none
+MAX_TOKENS = 512  # tokens of a prompt; far above any instruction, since the reference truncates none
 
 
 class Platform(NamedTuple):
-    """Constants and evaluation of a robot."""
+    """A robot's constants and the treatment of its gripper in the authors' evaluation."""
 
     horizon: int
     d_state: int
@@ -45,8 +45,8 @@ PLATFORMS: Dict[str, Platform] = {
     "libero": Platform(8, 8, 7, oft.VIEWS, oft.ALIASES),
     "calvin": Platform(8, 8, 7, ("rgb_static", "rgb_gripper"), ("", "")),
 }
-KIND = "openpi_quantiles"  # of BOUNDS_Q99: the same formula, on statistics in float64
-# vla_evaluation.py subtracts the gripper from 1, and evaluate_calvin.py takes the sign of what is between -1 and 1 then, of 0 too, and turns it.
+KIND = "openpi_quantiles"  # the formula of BOUNDS_Q99, with statistics in float64
+# vla_evaluation.py subtracts the gripper from 1; evaluate_calvin.py maps this to [-1, 1], takes the sign, also of 0, and inverts it.
 CALVIN: List[dict] = [{"op": "threshold", "columns": [oft.GRIPPER], "above": 0.5, "then": 1.0, "else": -1.0}]
 PLATFORM = Option(
     "--platform",
@@ -71,7 +71,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     statistics, mask = oft.ranges(stated, where, widths, ("q01", "q99"), problems)
     pixels = openvla.read_pixels(checkpoint, s.dino.image_size, problems)
     tokenizer = read_tokenizer(checkpoint.folder, s.lm.n_vocab, problems, checkpoint.notes)
-    problems.raise_any()  # a prompt takes a sound tokenizer
+    problems.raise_any()  # the prompt needs a valid tokenizer
     text = _text_ops(tokenizer, problems)
     n, aliases = len(cameras), platform.aliases if cameras == platform.views else ("",) * len(cameras)
     views_keys = views_of([view_name(name) for name in cameras], [alias and view_name(alias) for alias in aliases], [0] * n, n)
@@ -99,7 +99,7 @@ def _text_ops(tokenizer: TokenizerPlan, problems: Problems) -> List[dict]:
 
 
 def _read_tensors(folder: str, problems: Problems) -> Tensors:
-    """The language model's, and those of both files beside it."""
+    """The tensors of the language model, and of the two files beside it."""
     modulated = sorted(name for name in os.listdir(folder) if name.startswith("vision_backbone--"))
     if modulated:
         problems.unsupported(modulated[0], "towers that no instruction modulates", "those of a policy trained with use_film")

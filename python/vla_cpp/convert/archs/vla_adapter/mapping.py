@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of VLA-Adapter and the names of its tensors. Towers are OpenVLA's; an absent key of the language model means the default of the
-reference's Qwen2Config, which stands beside the key. The head has no config: its version shows in its tensors, and the rest is literals of
+"""Sizes of VLA-Adapter and the names of its tensors. The towers are OpenVLA's; an absent key of the language model has the default of the
+reference's Qwen2Config, listed here with the key. The head has no config: its tensors identify its version, and other values are literals of
 the reference's code.
 
 Reference: OpenHelix-Team/VLA-Adapter prismatic/extern/hf (configuration_prismatic.py, modeling_prismatic.py), prismatic/models
@@ -38,7 +38,7 @@ TEXT_FIXED: Fixed = {
     "use_mrope": (False, False),
     "rope_scaling": (None, None),
 }
-# Keys without effect on actions, beside those of OpenVLA: of tokens as answers, and of windows that nothing uses.
+# Keys without effect on actions, beside those of OpenVLA: settings of answers in tokens, and of unused attention windows.
 IGNORED = prismatic.IGNORED | set("eos_token_id max_window_layers n_action_bins pad_to_multiple_of sliding_window".split())
 
 
@@ -52,7 +52,7 @@ class Sizes:
     d_action: int = 0
     horizon: int = 0
     is_pro: bool = False
-    tokens: str = EMBEDDING  # the tensor whose rows stand for tokens
+    tokens: str = EMBEDDING  # name of the tensor with the token embeddings
     n_query: int = N_QUERY
     n_task: int = N_TASK
 
@@ -73,7 +73,8 @@ def read_sizes(checkpoint: Checkpoint, problems: Problems) -> Sizes:
 
 
 def _token_rows(checkpoint: Checkpoint, text: Section) -> str:
-    """Of tied tensors the one that the reference loads last: the language head, unless the other one is in a later file."""
+    """The tensor of token embeddings. Of tied tensors it is the one that the reference loads last: the language head, unless the embedding is
+    in a later file."""
     own, head, tied = checkpoint.tensors.get(EMBEDDING), checkpoint.tensors.get(LANGUAGE_HEAD), text.get("tie_word_embeddings")
     if not isinstance(tied, bool):
         text.bad("tie_word_embeddings", "true or false")
@@ -107,7 +108,7 @@ def network_keys(s: Sizes) -> List[Key]:
 
 
 def weights(s: Sizes, pixels: List[Dict[str, tuple]]) -> Rows:
-    """`pixels`: mean and std of what each tower reads."""
+    """Rows of all tensors. `pixels`: mean and std of each tower's pixels."""
     return [
         *prismatic.image_weights(s, pixels),
         *decoder(s.lm, LM, QWEN2, tokens=s.tokens),
@@ -125,14 +126,14 @@ def _attention(s: Sizes, target: str, source: str) -> Rows:
 
 
 def _projections(is_pro: bool) -> List[Tuple[str, str]]:
-    """What a block calls its matrices, here and there."""
+    """Names of a block's matrices in the bundle and in the checkpoint."""
     kinds = (("", "self"), ("actions.", "adapter"), ("task.", "task")) if is_pro else ()
     keys = [("{}attn_{}".format(ours, part), "{}_{}".format(part, theirs)) for ours, theirs in kinds for part in "kv"]
     return [("attn_q", "q_proj"), *(keys or [("attn_k", "k_proj"), ("attn_v", "v_proj")]), ("attn_out", "o_proj")]
 
 
 def dropped(s: Sizes) -> List[Dropped]:
-    """What no action depends on."""
+    """Tensors without effect on actions."""
     d, out = s.lm.d_model, prismatic.dropped(s)
     other = EMBEDDING if s.tokens == LANGUAGE_HEAD else LANGUAGE_HEAD
     out.append(Dropped(other, (s.lm.n_vocab, d), "no action depends on it: it is the language head, or what its tied rows replace"))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""VLA-JEPA: what its checkpoint states, as keys and tensors of a bundle.
+"""Converts checkpoints of VLA-JEPA to keys and tensors of a bundle.
 
 Reference: lerobot src/lerobot/policies/vla_jepa (configuration_vla_jepa.py, modeling_vla_jepa.py, qwen_interface.py, action_head.py,
 processor_vla_jepa.py) and transformers models/qwen3_vl.
@@ -26,12 +26,12 @@ from .mapping import dropped, hints, network_keys, weights
 
 CLIP, SNAP, BINARIZE = "vla_jepa_clip_actions", "vla_jepa_pre_snap_gripper", "vla_jepa_binarize_gripper"
 GRIPPER = {"gripper_dim": recipe.ANY, "threshold": recipe.ANY}
-PREPARE = "vla_jepa_image_prep"  # of releases after 0.6.1: the resizing that the policy did before; frames have three channels here
+PREPARE = "vla_jepa_image_prep"  # in releases after 0.6.1: the resize that the policy itself did until then; frames always have three channels here
 OWN_STEPS: recipe.Steps = {
     recipe.PRE: {PREPARE: {"resize_to": recipe.ANY, "expand_channels": (True,)}, **recipe.RELATIVE[recipe.PRE]},
     recipe.POST: {CLIP: {}, SNAP: GRIPPER, BINARIZE: GRIPPER, **recipe.RELATIVE[recipe.POST]},
 }
-# Of processor_vla_jepa.py. LeRobot saves neither number with the steps, and loads them as these again.
+# Defaults in processor_vla_jepa.py. LeRobot does not save these numbers with the steps, so loading restores the defaults.
 GRIPPER_DIM, GRIPPER_THRESHOLD = 6, 0.5
 
 
@@ -47,7 +47,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     own = [*s.action_tokens, s.embodied_token]
     tokenizer = read_tokenizer(s.folder, s.lm.n_vocab + len(own), problems, checkpoint.notes, own)
     problems.raise_any()
-    # The reference gives its table of tokens more rows where it has too few.
+    # The reference enlarges the table of tokens if it has too few rows.
     s.lm.n_vocab = max(s.lm.n_vocab, len(tokenizer.tokens))
     prompt = qwen3_vl.read_prompt(tokenizer, s.folder, s, problems, FOLDER)
     prompt = prompt._replace(n_token=min(prompt.n_token + len(s.prompt.encode()), s.n_context))
@@ -70,7 +70,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def _check_steps(checkpoint: Checkpoint, processors: recipe.Processors, problems: Problems) -> None:
-    """What config.json and the pipelines both say."""
+    """Checks that config.json and the pipelines agree."""
     size, relative = checkpoint.config.get("resize_images_to"), bool(checkpoint.config.get("use_relative_actions"))
     for step in member(checkpoint.processors[0], "steps", list, recipe.PRE):
         stated = member(step, "config", dict, recipe.PRE).get("resize_to", size) if step.get("registry_name") == PREPARE else size
@@ -82,7 +82,7 @@ def _check_steps(checkpoint: Checkpoint, processors: recipe.Processors, problems
 
 
 def image_ops(s: Sizes) -> List[dict]:
-    """In floats throughout: the reference gives its images to the backbone's processor as they are, without rescaling."""
+    """The image ops, all on floats: the reference passes its float images to the backbone's processor without rescaling."""
     size = {"op": "resize_floats", "width": s.image_width, "height": s.image_height, "filter": "bicubic"}
     if s.area == (0, 0):
         sizes = [{**size, "from_width": s.frame[0], "from_height": s.frame[1]}]
@@ -92,8 +92,9 @@ def image_ops(s: Sizes) -> List[dict]:
 
 
 def text_ops(s: Sizes, n_token: int) -> List[dict]:
-    """An instruction with a token of the prompt's own would give the head more rows, or images a place too many. One that is too long
-    loses the views' places, and is refused: the reference cuts none."""
+    """The text ops. An instruction that contains a special token of the prompt is refused: it would add rows to the head's input, or image
+    positions. An instruction that is too long is refused too: truncation on the left would remove the views, and the reference never
+    truncates."""
     views = {"open": qwen3_vl.OPEN, "token": qwen3_vl.IMAGE, "repeat": s.n_view_token, "close": qwen3_vl.CLOSE}
     return [
         *({"op": "refuse", "text": text} for text in (s.embodied_token, *PLACEHOLDERS)),
@@ -105,7 +106,7 @@ def text_ops(s: Sizes, n_token: int) -> List[dict]:
 
 
 def action_ops(checkpoint: Checkpoint, s: Sizes, processors: recipe.Processors, problems: Problems) -> List[dict]:
-    """The steps of the saved pipeline in its order."""
+    """The action ops, in the order of the saved pipeline's steps."""
     ops: List[dict] = []
     for i, step in enumerate(member(checkpoint.processors[1], "steps", list, recipe.POST)):
         name = step["registry_name"]
@@ -121,7 +122,8 @@ def action_ops(checkpoint: Checkpoint, s: Sizes, processors: recipe.Processors, 
 
 
 def gripper_ops(name: str, where: str, config: dict, s: Sizes, problems: Problems) -> List[dict]:
-    """A chunk without this column passes. The reference compares float32 numbers, one of them with >=, the runtime always with >."""
+    """The ops of a gripper step; empty for a chunk without the gripper's column. One of the reference's two steps compares float32 numbers with
+    >=; the runtime compares with >, so the threshold is then the next smaller float32."""
     column, threshold = config.get("gripper_dim", GRIPPER_DIM), config.get("threshold", GRIPPER_THRESHOLD)
     if type(column) is not int or column < 0:
         problems.unsupported(where + ": gripper_dim", "a column from 0 on", repr(column))

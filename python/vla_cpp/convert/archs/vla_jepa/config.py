@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes and prompt of a VLA-JEPA policy from its config.json and that of its backbone, and everything in them that the runtime cannot honour.
+"""Sizes and prompt of a VLA-JEPA policy from its config.json and that of its backbone. Refuses everything that the runtime does not support.
 
-An absent key means the default of the reference's own class, which is stated here beside the key. A checkpoint has the weights of
-Qwen3-VL but neither its config nor its tokenizer: both come with its folder.
+An absent key has the default of the reference's own class, listed here with the key. A checkpoint has the weights of
+Qwen3-VL but neither its config nor its tokenizer; --backbone names the folder with both.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .. import Options
 from ..gr00t import qwen3_vl, sizes
 from ..gr00t.images import MAX_SIDE, held_size
 
-# VLAJEPAConfig's keys that numbers depend on, with the defaults of the class.
+# VLAJEPAConfig keys with effect on numbers, with the class's defaults.
 POLICY = {
     "chunk_size": 7,
     "n_action_steps": 7,
@@ -52,8 +52,8 @@ POLICY = {
     "use_relative_actions": False,
     "torch_dtype": "bfloat16",
 }
-# Keys that no number of an action chunk depends on, beside those of every policy of LeRobot: those of training, of the world model, and
-# those from which LeRobot made the saved pipelines, which say what is done.
+# Keys without effect on the numbers of an action chunk, beside those of every LeRobot policy: keys of training, of the world model, and
+# keys from which LeRobot built the saved pipelines, which are read instead.
 IGNORED = set(
     """jepa_encoder_name reinit_modules tokenizer_padding_side action_dropout action_noise_beta_alpha action_noise_beta_beta
     action_noise_s num_target_vision_tokens action_max_seq_len predictor_depth predictor_num_heads predictor_mlp_ratio
@@ -61,37 +61,37 @@ IGNORED = set(
     clip_normalized_actions gripper_dim gripper_threshold optimizer_grad_clip_norm relative_exclude_joints action_feature_names
     gripper_joint_names""".split()
 )
-# Keys of later releases, whose other values ask for something that the runtime does not do.
+# Keys of later releases, with the only value that the runtime supports and the reason.
 FIXED = {
     "causal_world_model_context": (False, "the prompt would have other moments"),
     "world_model_num_views": (None, "the world model would see other views"),
 }
-PRESETS = {"DiT-B": (12, 64), "DiT-L": (32, 48), "DiT-test": (2, 8)}  # heads and the width of one (action_head.py DIT_PRESETS)
+PRESETS = {"DiT-B": (12, 64), "DiT-L": (32, 48), "DiT-test": (2, 8)}  # number of heads and width of a head (action_head.py DIT_PRESETS)
 PLACES = ("{instruction}", "{actions}", "{e_actions}")
 FOLDER = "--backbone needs the folder of Qwen/Qwen3-VL-2B-Instruct, or of the model that qwen_model_name names"
 ENCODER = "model.video_encoder.encoder.embeddings.patch_embeddings.proj.weight"
-MAX_TEMPLATE = 1 << 12  # bytes, as the runtime reads one
+MAX_TEMPLATE = 1 << 12  # bytes, the runtime's limit
 EMBEDDING = "model.qwen.model.model.language_model.embed_tokens.weight"
-# What the backbone's processor puts images in the place of; no text may have it.
+# Tokens that the backbone's processor replaces by images; no text may contain them.
 PLACEHOLDERS = (qwen3_vl.IMAGE, "<|video_pad|>", "<|placeholder|>")
 
 
 @dataclass
 class Sizes(sizes.Sizes):
     views: Sequence[str] = ()
-    frame: Tuple[int, int] = (0, 0)  # width and height of the only frames that are taken, where the images' size follows from it
-    area: Tuple[int, int] = (0, 0)  # width and height that frames get first, where the policy states it
+    frame: Tuple[int, int] = (0, 0)  # width and height that all frames must have, if the images' size is computed from them
+    area: Tuple[int, int] = (0, 0)  # width and height to which frames are resized first, if the policy states it
     n_embodied: int = 0
-    action_tokens: Sequence[str] = ()  # that the policy adds to the tokenizer
+    action_tokens: Sequence[str] = ()  # tokens that the policy adds to the tokenizer
     embodied_token: str = ""
-    prompt: str = ""  # with a place for the instruction
-    folder: str = ""  # the backbone's
+    prompt: str = ""  # contains {instruction}
+    folder: str = ""  # folder of the backbone
     in_bf16: bool = False  # the reference holds the backbone in bfloat16
-    world_model: Dict[str, Tuple[int, ...]] = field(default_factory=dict)  # its tensors
+    world_model: Dict[str, Tuple[int, ...]] = field(default_factory=dict)  # shapes of its tensors by name
 
 
 def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> Sizes:
-    # The class has no empty_cameras.
+    # The reference's class has no empty_cameras.
     policy = Section("config.json", checkpoint.config, {**POLICY, "empty_cameras": 0}, problems)
     no_position_rule(policy, options, problems)
     check_keys(policy, "VLAJEPAConfig", set(POLICY) | IGNORED, FIXED)
@@ -113,7 +113,8 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
 
 
 def _check_tie(checkpoint: Checkpoint, folder: str, problems: Problems) -> None:
-    """An embedding that is stored once, as the language head, is what the config must tie it to: else the reference makes a random one."""
+    """Checks that the config ties embedding and language head if only the head is stored: otherwise the reference initializes the embedding
+    randomly."""
     config = read_json(os.path.join(folder, "config.json"))
     tied = config.get("tie_word_embeddings")
     if EMBEDDING in checkpoint.aliases and EMBEDDING not in checkpoint.tensors and tied is not True:
@@ -122,7 +123,7 @@ def _check_tie(checkpoint: Checkpoint, folder: str, problems: Problems) -> None:
 
 
 def _read_images(policy: Section, s: Sizes, problems: Problems) -> None:
-    """Without a size of the policy's own the backbone's processor makes images of the cameras' frames as they come."""
+    """Reads the size of the images. If the policy states none, the backbone's processor computes it from the size of the cameras' frames."""
     size, where = policy.get("resize_images_to"), "config.json: resize_images_to"
     if size is not None:
         if not isinstance(size, list) or len(size) != 2 or any(type(side) is not int or not 2 <= side <= MAX_SIDE for side in size):
@@ -153,7 +154,7 @@ def _read_head(policy: Section, checkpoint: Checkpoint, options: Options, s: Siz
     if preset not in PRESETS:
         policy.bad("action_model_type", " or ".join(PRESETS), unsupported=True)
     heads, width = PRESETS.get(str(preset), PRESETS["DiT-B"])
-    # The reference takes a 0 for an absent number.
+    # The reference treats 0 like an absent number.
     s.n_dit_head = policy.count("action_num_heads") if policy.get("action_num_heads") else heads
     s.d_dit = s.n_dit_head * (policy.count("action_attention_head_dim") if policy.get("action_attention_head_dim") else width)
     s.n_dit_layer, s.d_hidden = policy.count("action_num_layers", maximum=MAX_LAYERS), policy.count("action_hidden_size")
@@ -165,11 +166,11 @@ def _read_head(policy: Section, checkpoint: Checkpoint, options: Options, s: Siz
     s.horizon, s.n_step = policy.count("chunk_size", maximum=4096), policy.count("num_inference_timesteps")
     s.n_bucket = policy.count("action_num_timestep_buckets")
     s.n_embodied = policy.count("num_embodied_action_tokens_per_instruction", maximum=4096)
-    s.n_position = max(1024, s.horizon + policy.count("num_action_tokens_per_timestep") + 4)  # as the reference makes the table
+    s.n_position = max(1024, s.horizon + policy.count("num_action_tokens_per_timestep") + 4)  # rows of the table as in the reference
 
 
 def _read_state(policy: Section, checkpoint: Checkpoint, options: Options) -> int:
-    """Width of the state, 0 where the policy reads none. Without the feature a robot's state would come to the network as it is."""
+    """Width of the state; 0 if the policy reads none. Refuses a network with a state whose feature is missing: nothing would normalize it."""
     features = policy.get("input_features")
     if isinstance(features, dict) and STATE in features:
         return state_width(policy, checkpoint, options, padded=False)
@@ -180,8 +181,8 @@ def _read_state(policy: Section, checkpoint: Checkpoint, options: Options) -> in
 
 
 def _read_prompt(policy: Section, checkpoint: Checkpoint, s: Sizes) -> None:
-    """VLAJEPAModel.__init__ and Qwen3VLInterface.expand_tokenizer, build_inputs. The prompt ends with its last embodied token: what is
-    behind it, no other token sees."""
+    """Reads the prompt (VLAJEPAModel.__init__, Qwen3VLInterface.expand_tokenizer, build_inputs). The prompt is cut after its last embodied
+    token, since no used token attends to later ones."""
     template, embodied, action = (policy.get(key) for key in ("prompt_template", "embodied_action_token", "special_action_token"))
     if not isinstance(action, str) or action.count("{}") != 1 or action.count("{") + action.count("}") != 2:
         policy.bad("special_action_token", "text with {} once and no other braces")
@@ -219,7 +220,7 @@ def _is_template(text: str) -> bool:
 
 
 def _n_moment(policy: Section, checkpoint: Checkpoint, s: Sizes) -> int:
-    """Moments that the prompt has action tokens for: those that the world model's encoder makes of the frames of its video, but one."""
+    """Number of moments for which the prompt has action tokens: one less than the moments that the world model's encoder makes of a video."""
     n_frame, tubelet = policy.count("num_video_frames"), policy.count("jepa_tubelet_size")
     if policy.get("enable_world_model") and not policy.get("freeze_qwen"):
         s.world_model = {name: entry.shape for name, entry in checkpoint.tensors.items() if name.startswith("model.video_")}

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keys of the network and names, storage and shapes of every tensor of VLA-JEPA: Qwen3-VL as GR00T N1.7 has it, and the layers of GR00T's
-head, for one robot."""
+"""Keys of the network and names, storage and shapes of every tensor of VLA-JEPA: Qwen3-VL as in GR00T N1.7, and the layers of GR00T's head
+for a single robot."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from ..gr00t.plan import network_keys_of
 from .config import Sizes
 
 QWEN, HEAD = "model.qwen.model.", "model.action_model."
-GROOT_QWEN = "backbone.model."  # where GR00T has it
+GROOT_QWEN = "backbone.model."  # GR00T's prefix of Qwen3-VL
 Row = TypeVar("Row", Weight, Dropped)
 
 
 def network_keys(s: Sizes) -> List[Key]:
-    """The head has no self-attention over the features in front of it."""
+    """Keys of the network. Unlike GR00T's, the head has no self-attention over the features."""
     keys = network_keys_of(qwen3_vl, s, {"policy": dict(n_future=s.n_embodied, n_embodied=s.n_embodied)})
     return [key for key in keys if not key.name.startswith("vl.")]
 
 
 def weights(s: Sizes) -> Rows:
-    """The head is float32 in the reference whatever the backbone is."""
+    """Rows of all tensors. In the reference the head is always float32, whatever the backbone's type."""
     backbone = [_moved(row, GROOT_QWEN, QWEN)._replace(in_bf16=s.in_bf16) for row in qwen3_vl.weights(s)]
     return [*backbone, *(row._replace(keep_f32=True) for row in _head(s))]
 
 
 def _moved(row: Row, theirs: str, ours: str) -> Row:
-    """A tensor of GR00T at the place where this policy has it."""
+    """A row of GR00T's mapping, with the prefix `theirs` of the checkpoint's name replaced by `ours`."""
     assert row.source.startswith(theirs)
     return row._replace(source=ours + row.source[len(theirs) :])
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""X-VLA: what its checkpoint states, as keys and tensors of a bundle.
+"""Converts checkpoints of X-VLA to keys and tensors of a bundle.
 
-A checkpoint holds layers and prompts of many domains, a bundle those that --embodiment names, or that of the preprocessor.
+A checkpoint has layers and prompts for many domains; a bundle has those that --embodiment names, or the preprocessor's domain.
 Reference: lerobot src/lerobot/policies/xvla (configuration_xvla.py, modeling_xvla.py, soft_transformer.py, action_hub.py,
 processor_xvla.py) and transformers models/florence2 and models/bart.
 """
@@ -29,7 +29,7 @@ TOKENIZER = "facebook/bart-large"
 TO_FLOAT, NORMALIZE, DOMAIN = "xvla_image_to_float", "xvla_imagenet_normalize", "xvla_add_domain_id"
 STEPS: recipe.Steps = {
     recipe.PRE: {
-        # Frames enter in [0, 1] here. One that is black but for a few ones, as bytes, the reference does not divide by 255.
+        # Frames enter in [0, 1] here. The reference does not divide a frame by 255 if no byte of it is above 1.
         TO_FLOAT: {"image_keys": (None,), "validate_range": (True, False)},
         NORMALIZE: {"image_keys": (None,)},
         DOMAIN: {"domain_id": recipe.ANY},
@@ -38,7 +38,7 @@ STEPS: recipe.Steps = {
 
 
 def embodiments(checkpoint: Checkpoint) -> List[str]:
-    """Domains are told by their numbers."""
+    """The tags of the domains, which are their numbers."""
     count = checkpoint.config.get("num_domains", 30)
     return [str(domain) for domain in range(count if isinstance(count, int) else 0)]
 
@@ -71,7 +71,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def _steps(preprocessor: dict) -> Dict[str, dict]:
-    """Settings by name, in their order; what is amiss with them recipe.read_processors tells."""
+    """Settings of the steps by name, in order. recipe.read_processors reports invalid ones."""
     steps = preprocessor.get("steps")
     found = [step for step in steps if isinstance(step, dict)] if isinstance(steps, list) else []
     configs = {step.get("registry_name"): step.get("config", {}) for step in found}
@@ -84,7 +84,7 @@ def _check_order(steps: Sequence[str], problems: Problems) -> None:
 
 
 def recipe_document(s: Sizes, processors: recipe.Processors, truncate: str, is_normalized: bool) -> Dict[str, List[dict]]:
-    """The reference resizes pixels that are normalized, and puts zeros beside them: in [0, 1] those are the mean."""
+    """The recipe. The reference resizes normalized pixels and pads with zeros, which in [0, 1] are the mean."""
     width, height = s.frame
     size = {"width": width, "height": height}
     fit = [{"op": "camera_size", **size}, {"op": "size", **size}]
@@ -108,7 +108,7 @@ def _state(s: Sizes, processors: recipe.Processors) -> List[dict]:
 
 
 def _pad_token(folder: str, tokenizer: TokenizerPlan, problems: Problems) -> int:
-    """The reference hides no padding from its network, so that its id counts."""
+    """The id of the pad token. The reference does not mask padding, so the id affects the network."""
     path = os.path.join(folder, CONFIG_FILE)
     stated = content_of((read_json(path) if os.path.exists(path) else {}).get("pad_token", "<pad>"))
     if stated in tokenizer.tokens:

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of an X-VLA policy from its config.json, and everything in it that the runtime cannot honour.
+"""Sizes of an X-VLA policy from its config.json, with refusals of everything that the runtime does not support.
 
-An absent key means the default of the reference's own class, which is stated here beside the key. The backbone's config stands in
-`florence_config`, as transformers spells it or as the authors' own code does.
+An absent key has the default of the reference's own class, listed here with the key. The backbone's config is in
+`florence_config`, in the form of transformers or of the authors' own code.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ...recipe import ACTION, STATE
 from ...section import Section
 from .. import Options
 
-# XVLAConfig's keys that numbers depend on, with the defaults of the class.
+# XVLAConfig keys with effect on numbers, with the class's defaults.
 POLICY = {
     "chunk_size": 32,
     "n_action_steps": 32,
@@ -45,8 +45,8 @@ POLICY = {
     "empty_cameras": 0,
 }
 FIXED = {"domain_feature_key": (None, "the act names the domain, where the bundle has several")}
-# Keys that no number of an action chunk depends on, beside those of every policy of LeRobot. What happens to text stands in the
-# preprocessor.
+# Keys without effect on the numbers of an action chunk, beside those of every LeRobot policy. The preprocessor
+# determines the treatment of text.
 IGNORED = set(
     """
     tokenizer_name tokenizer_max_length tokenizer_padding_side pad_language_to freeze_vision_encoder freeze_language_encoder
@@ -56,12 +56,12 @@ IGNORED = set(
 
 
 class ActionSpace(NamedTuple):
-    """A class of action_hub.py. `columns`: of the network, `actions`: of the robot; 0: as the config says."""
+    """A class of action_hub.py. columns: numbers of an action in the network; actions: numbers for the robot; 0: stated in the config."""
 
     columns: int
     actions: int
-    grippers: Sequence[int] = ()  # columns that are logits, and that the network does not see of actions and state
-    state: int = 0  # the state must have so many numbers for the network
+    grippers: Sequence[int] = ()  # columns that are logits; the network does not see these columns of actions and state
+    state: int = 0  # numbers of the state that the network needs
 
 
 SPACES = {
@@ -72,7 +72,7 @@ SPACES = {
     "so101_bimanual": ActionSpace(20, 12, (5, 11), 20),
     "auto": ActionSpace(0, 0),
 }
-# Florence2VisionConfig and BartConfig, with the defaults of the classes. Keys that they do not read stay without effect there too.
+# Florence2VisionConfig and BartConfig, with the classes' defaults. Keys that they do not read have no effect in the reference either.
 VISION: Dict[str, object] = {
     "depths": [1, 1, 9, 1],
     "patch_size": [7, 3, 3, 3],
@@ -120,18 +120,18 @@ class Sizes:
     frame: Tuple[int, int] = (0, 0)  # width, height
     resizes: bool = False
     state_dim: int = 0  # 0: the policy reads none
-    unread_dim: int = 0  # of a state that robots send and the network does not read
+    unread_dim: int = 0  # width of a state that robots send and the network does not read
     action_dim: int = 0
     d_state: int = 0
     d_action: int = 0
     grippers: List[int] = field(default_factory=list)
     horizon: int = 0
     n_step: int = 0
-    n_token: int = 0  # to which text is padded, 0: it is not
+    n_token: int = 0  # number of tokens to which text is padded; 0: no padding
     pad_token: int = 0
     in_bf16: bool = False
     vendored: bool = False  # tensors have the names of the authors' own code
-    tokens: str = ""  # the tensor of the token table
+    tokens: str = ""  # name of the tensor with the token table
     stages: Sequence[Stage] = ()
     window: int = 0
     n_cell_position: int = 0
@@ -163,7 +163,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
 
 
 def read_domain(options: Options, step: dict, n_domain: int, problems: Problems) -> int:
-    """That of --embodiment, or of the preprocessor. Errors: usage."""
+    """The domain of --embodiment, else of the preprocessor. Errors: usage."""
     if options.embodiment:
         stated, where, code = options.embodiment, "--embodiment", Code.USAGE
     else:
@@ -192,7 +192,7 @@ def _read_policy(policy: Section, s: Sizes) -> None:
 
 
 def _read_spaces(policy: Section, checkpoint: Checkpoint, options: Options, s: Sizes) -> None:
-    """Widths of actions and state. The reference cuts a wider state; its feature should say what is read."""
+    """Reads the widths of actions and state. The reference cuts a wider state, so the feature should state the width that is read."""
     mode = policy.get("action_mode")
     if not isinstance(mode, str) or mode.lower() not in SPACES:
         policy.bad("action_mode", " or ".join(SPACES), unsupported=True)
@@ -214,8 +214,8 @@ def _read_spaces(policy: Section, checkpoint: Checkpoint, options: Options, s: S
 
 
 def _read_views(policy: Section, checkpoint: Checkpoint, s: Sizes) -> None:
-    """The network has places for as many views as validate_features of the reference counts, which counts those that empty_cameras adds a
-    second time where the file lists them."""
+    """Reads the views. The network has as many slots as validate_features of the reference counts; it counts views of empty_cameras twice if
+    the file lists them too."""
     s.views, n_empty = read_views(policy, checkpoint)
     features = member(checkpoint.config, "input_features", dict, "config.json")
     listed = [view for view in s.views if view in features]
@@ -265,7 +265,7 @@ def _read_florence(policy: Section, s: Sizes, problems: Problems) -> None:
 
 
 def _translated(vision: dict, problems: Problems) -> dict:
-    """In transformers' spelling. Reference: configuration_xvla.py _translate_vision_config."""
+    """The vision config in transformers' form. Reference: configuration_xvla.py _translate_vision_config."""
     where, out = "config.json: florence_config.vision_config", dict(vision)
     kind = out.pop("model_type", None)
     if kind not in (None, "davit", "florence_vision"):
@@ -314,7 +314,7 @@ def _read_vision(vision: Section, s: Sizes) -> None:
 
 
 def _numbers(vision: Section, name: str) -> list:
-    """Of every stage."""
+    """The values of a key, one per stage."""
     values, kind = vision.get(name), bool if name == "patch_prenorm" else int
     low = 0 if name == "patch_padding" else 1
     if isinstance(values, list) and all(type(value) is kind and (kind is bool or low <= value <= 1 << 16) for value in values):
@@ -324,7 +324,8 @@ def _numbers(vision: Section, name: str) -> list:
 
 
 def _read_names(checkpoint: Checkpoint, s: Sizes) -> None:
-    """Reference: modeling_xvla.py _is_vendored_florence_state_dict. Of the token table's two names a file may have either."""
+    """Finds out which tensor names the file has; the token table may have either of two names. Reference: modeling_xvla.py
+    _is_vendored_florence_state_dict."""
     prefix = "model.vlm."
     s.vendored = any(
         name == prefix + "image_projection" or name.startswith(prefix + "language_model.model.") for name in checkpoint.tensors

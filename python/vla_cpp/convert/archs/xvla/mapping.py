@@ -15,14 +15,14 @@ from .config import Sizes, Stage
 
 VLM, HEAD = "model.vlm.", "model.transformer."
 TOWER, PROJECTOR, ENCODER = VLM + "vision_tower.", VLM + "multi_modal_projector.", VLM + "language_model.encoder."
-POSITION_OFFSET = 2  # rows in front of the first position (transformers modeling_bart.py BartLearnedPositionalEmbedding)
+POSITION_OFFSET = 2  # rows before the first position (transformers modeling_bart.py BartLearnedPositionalEmbedding)
 DAVIT = {
     kind: Names("{0}.qkv. {0}.proj".format(attention), "ffn.fc1 ffn.fc2", "norm1 norm2")
     for kind, attention in (("spatial", "window_attn"), ("channel", "channel_attn"))
 }
 BART = Names("self_attn.q_proj self_attn.k_proj self_attn.v_proj self_attn.out_proj", "fc1 fc2", "self_attn_layer_norm final_layer_norm")
 BLOCK = Names("attn.qkv. attn.proj", "mlp.fc1 mlp.fc2", "norm1 norm2")
-# transformers' names of Florence-2's parts -> those of the authors' own code, whose inverse is the reference's
+# transformers' names of Florence-2's parts -> names in the authors' own code; the inverse of the reference's
 # _remap_vendored_florence_state_dict (modeling_xvla.py).
 VENDORED = [
     (r"(\.convs\.\d+)\.conv\.", r"\1.proj."),
@@ -73,7 +73,7 @@ def weights(s: Sizes) -> Rows:
 
 
 def of_domain(target: str, source: str, d_out: int, d_in: int, s: Sizes) -> Rows:
-    """A layer that each domain has of its own: a row of a table is its matrix (in, out)."""
+    """The domain's own layer: each row of a table is the matrix (in, out) of one domain."""
     pick = (0, s.domain)
     return [
         Weight(target + ".weight", source + ".fc.weight", MATRIX, (s.n_domain, d_in * d_out), (d_out, d_in), pick=pick, regroup=d_out),
@@ -87,7 +87,7 @@ def _florence(s: Sizes) -> Rows:
 
 
 def _vendored(row: Weight, s: Sizes) -> Weight:
-    """The authors' projection is a matrix (in, out) without a module."""
+    """The row with the name in the authors' code, where the projection is a plain parameter (in, out)."""
     if row.source == PROJECTOR + "image_projection.weight":
         return row._replace(source=VLM + "image_projection", stored=row.stored[::-1], transpose=True)
     return row._replace(source=row.source if row.source == s.tokens else old_name(row.source))
@@ -126,7 +126,7 @@ def _projector(s: Sizes) -> Rows:
         *norm("projector.norm", PROJECTOR + "image_proj_norm", s.lm.d_model),
         *table("row", cell + "row_embeddings.weight", n, d // 2),
         *table("column", cell + "column_embeddings.weight", n, d - d // 2),
-        # A frame is the first moment, and there is no other.
+        # Only the first moment is used: there is one frame.
         *vector("temporal.weight", PROJECTOR + "visual_temporal_embed.pos_idx_to_embed", d, (s.n_moment, d), pick=(0, 0)),
     ]
 
