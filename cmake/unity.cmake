@@ -16,13 +16,6 @@ function(vla_group target)
   set_target_properties(${target} PROPERTIES UNITY_BUILD ${VLA_UNITY} UNITY_BUILD_BATCH_SIZE ${size})
 endfunction()
 
-# For code that runs in every act but computes little: -O3 takes a sixth longer to compile and makes it no faster.
-function(vla_optimize_host target)
-  if(NOT VLA_SANITIZE)
-    target_compile_options(${target} PRIVATE -O2)
-  endif()
-endfunction()
-
 # For code that runs once, at load or in a test: compiling it takes longer than running it.
 function(vla_optimize_little target)
   if(VLA_SANITIZE)
