@@ -234,13 +234,17 @@ def record(bundle, folder, observations):
     return folder
 
 
+def percent_moved(got, expected):
+    """Root mean square of the difference, in percent of that of `expected`: over all observations, and the median one's.  Both (observation, row, column)."""
+    squares = np.mean((got - expected) ** 2, axis=(1, 2)) / np.mean(expected**2)
+    return 100 * np.sqrt(np.mean(squares)), 100 * np.sqrt(np.median(squares))
+
+
 def judge(bundle, work, recording, observations, expected, programs, dtypes, has_blocks):
     """Percent of all observations and of the median one, for each dtype and column."""
 
     def moved(made, kernels=None):
-        got = chunks(made, observations, kernels)
-        squares = np.mean((got - expected) ** 2, axis=(1, 2)) / np.mean(expected**2)
-        return 100 * np.sqrt(np.mean(squares)), 100 * np.sqrt(np.median(squares))
+        return percent_moved(chunks(made, observations, kernels), expected)
 
     def quantized(program, *options):
         answer = subprocess.run([program, "quantize", bundle, "-o", work / "codes.gguf", "--force", *options], capture_output=True, text=True)

@@ -4,6 +4,8 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
+
 #include "devices/devices.h"
 #include "policies/policy.h"
 

@@ -5,6 +5,7 @@
 // Source: gRPC, doc/PROTOCOL-HTTP2.md.
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <boost/asio/post.hpp>
 
 #include "door/connection.h"

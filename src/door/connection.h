@@ -8,6 +8,10 @@
 #include <deque>
 #include <exception>
 #include <list>
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
 
 #include "door/floods.h"
 #include "door/rpcs.h"

@@ -8,7 +8,6 @@
 #include "fuzz/act_target.h"
 #include "fuzz/mutant.h"
 #include "support/editable_bundle.h"
-#include "support/golden_case.h"
 #include "support/joint_bundle.h"
 
 using namespace vla;

@@ -111,8 +111,8 @@ def vla_rows(program, bundle, observations, seen, work):
 
 def print_row(name, chunks, expected):
     """chunks, expected: (observation, row, column); columns beyond the robot's are left out."""
-    squares = np.mean((chunks[..., : expected.shape[2]] - expected) ** 2, axis=(1, 2)) / np.mean(expected**2)
-    print(f"| {name} | {100 * np.sqrt(np.mean(squares)):.3g} % | {100 * np.sqrt(np.median(squares)):.3g} % |", flush=True)
+    error, median = held_out.percent_moved(chunks[..., : expected.shape[2]], expected)
+    print(f"| {name} | {error:.3g} % | {median:.3g} % |", flush=True)
 
 
 def main():
