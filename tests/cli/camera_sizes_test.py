@@ -16,7 +16,7 @@ sys.path.append(str(ROOT / "tests/support"))
 from camera_frames import frame  # noqa: E402
 
 RECORDED = json.loads((ROOT / "tests/golden/camera_sizes.json").read_text())
-CLOSE = 1e-5  # of the largest action, or of 1: sums in another order
+CLOSE = 2e-5  # of the largest action, or of 1: sums in another order. Farthest: OpenVLA-OFT with AVX2, 1.3e-5
 
 
 @pytest.mark.parametrize("name", RECORDED)
