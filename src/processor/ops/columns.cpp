@@ -149,7 +149,7 @@ struct ColumnStateOp final : StateOp {
 };
 
 template <class Params>
-Status parse_state(JsonFields& fields, Recipe& recipe) {
+Status parse_column_state(JsonFields& fields, Recipe& recipe) {
   if (last_stage(recipe) == StateOp::Stage::end) return misplaced(fields, "nothing after pad, bins or drop");
   if (last_stage(recipe) != StateOp::Stage::convention)
     return misplaced(fields, "the robot's conventions before normalize");
@@ -207,7 +207,7 @@ struct ClipActionOp final : ActionOp {
 };
 
 template <class Op>
-Status parse_action(JsonFields& fields, Recipe& recipe) {
+Status parse_column_action(JsonFields& fields, Recipe& recipe) {
   auto op = std::make_unique<Op>();
   VLA_CHECK(read(fields, op->params));
   recipe.action.push_back(std::move(op));
@@ -246,15 +246,15 @@ Status parse_add_state(JsonFields& fields, Recipe& recipe) {
 }  // namespace
 
 Ops columns_ops() {
-  return {{"state", "affine", parse_state<ColumnAffine>},
-          {"state", "horn_angle", parse_state<HornAngle>},
-          {"state", "threshold", parse_state<Threshold>},
+  return {{"state", "affine", parse_column_state<ColumnAffine>},
+          {"state", "horn_angle", parse_column_state<HornAngle>},
+          {"state", "threshold", parse_column_state<Threshold>},
           {"state", "clip", parse_state_clip},
-          {"action", "affine", parse_action<ColumnActionOp<ColumnAffine>>},
-          {"action", "threshold", parse_action<ColumnActionOp<Threshold>>},
-          {"action", "sign", parse_action<ColumnActionOp<Sign>>},
-          {"action", "sigmoid", parse_action<ColumnActionOp<Sigmoid>>},
-          {"action", "clip", parse_action<ClipActionOp>},
+          {"action", "affine", parse_column_action<ColumnActionOp<ColumnAffine>>},
+          {"action", "threshold", parse_column_action<ColumnActionOp<Threshold>>},
+          {"action", "sign", parse_column_action<ColumnActionOp<Sign>>},
+          {"action", "sigmoid", parse_column_action<ColumnActionOp<Sigmoid>>},
+          {"action", "clip", parse_column_action<ClipActionOp>},
           {"action", "add_state", parse_add_state}};
 }
 

@@ -257,7 +257,7 @@ struct LetterboxFit final : OneFit<Letterbox> {
   }
 };
 
-Status parse(JsonFields& fields, Recipe& recipe) {
+Status parse_letterbox(JsonFields& fields, Recipe& recipe) {
   if (recipe.fit != nullptr) return misplaced(fields, "a letterbox as the first and only op on images of any size");
   VLA_TRY(const Letterbox op, read_letterbox(fields));
   recipe.fit = std::make_unique<LetterboxFit>(op);
@@ -268,6 +268,6 @@ Status parse(JsonFields& fields, Recipe& recipe) {
 
 }  // namespace
 
-Ops letterbox_ops() { return {{"image", "letterbox", parse}}; }
+Ops letterbox_ops() { return {{"image", "letterbox", parse_letterbox}}; }
 
 }  // namespace vla

@@ -91,7 +91,7 @@ Status read(JsonFields& fields, StandardizeOp& op) {
 }
 
 template <class Op>
-Status parse(JsonFields& fields, Recipe& recipe) {
+Status parse_plane(JsonFields& fields, Recipe& recipe) {
   if (recipe.width == 0) return misplaced(fields, "a letterbox or a resize first, or ops that end in size");
   auto op = std::make_unique<Op>();
   VLA_CHECK(read(fields, *op));
@@ -102,9 +102,9 @@ Status parse(JsonFields& fields, Recipe& recipe) {
 }  // namespace
 
 Ops planes_ops() {
-  return {{"image", "affine", parse<AffineOp>},
-          {"image", "clip", parse<ClipOp>},
-          {"image", "standardize", parse<StandardizeOp>}};
+  return {{"image", "affine", parse_plane<AffineOp>},
+          {"image", "clip", parse_plane<ClipOp>},
+          {"image", "standardize", parse_plane<StandardizeOp>}};
 }
 
 }  // namespace vla

@@ -16,14 +16,12 @@
 namespace vla {
 namespace {
 
-using Matrix = Matrix3<double>;
-
-Matrix transposed(const Matrix& m) { return {m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]}; }
+Matrix3<double> transposed(const Matrix3<double>& m) { return {m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]}; }
 
 /// The nearest rotation to a matrix that is a rotation up to rounding errors, by Newton's method.
-Matrix nearest_rotation(Matrix m) {
+Matrix3<double> nearest_rotation(Matrix3<double> m) {
   for (int step = 0; step < 2; ++step) {
-    Matrix correction = product(transposed(m), m);
+    Matrix3<double> correction = product(transposed(m), m);
     for (std::size_t i = 0; i < 9; ++i) correction[i] = (i % 4 == 0 ? 1.5 : 0.0) - 0.5 * correction[i];
     m = product(m, correction);
   }
@@ -38,7 +36,7 @@ T dot(const T* a, const T* b) {
 }
 
 template <class T>
-Matrix rotation_of_rows(const T* rows) {
+Matrix3<double> rotation_of_rows(const T* rows) {
   T first[3], second[3];
   const T length = std::sqrt(dot(rows, rows));
   for (int i = 0; i < 3; ++i) first[i] = rows[i] / length;
@@ -46,7 +44,7 @@ Matrix rotation_of_rows(const T* rows) {
   for (int i = 0; i < 3; ++i) second[i] = rows[3 + i] - along * first[i];
   const T rest = std::sqrt(dot(second, second));
   for (T& x : second) x /= rest;
-  Matrix out;
+  Matrix3<double> out;
   std::copy_n(first, 3, out.begin());
   std::copy_n(second, 3, out.begin() + 3);
   for (std::size_t i = 0; i < 3; ++i) {
@@ -56,7 +54,7 @@ Matrix rotation_of_rows(const T* rows) {
   return nearest_rotation(out);
 }
 
-Matrix rotation_of_vector(const double* v) {
+Matrix3<double> rotation_of_vector(const double* v) {
   const double angle = std::sqrt(dot(v, v)), square = angle * angle;
   // For small angles, the quotient is computed by its series.
   const double scale = angle <= 1e-3 ? 0.5 - square / 48 + square * square / 3840 : std::sin(angle / 2) / angle;
@@ -67,7 +65,7 @@ Matrix rotation_of_vector(const double* v) {
 }
 
 /// Computes the quaternion from its largest component, which loses the fewest digits.
-void write_vector(const Matrix& m, double* out) {
+void write_vector(const Matrix3<double>& m, double* out) {
   const std::array<double, 4> parts = {m[0], m[4], m[8], m[0] + m[4] + m[8]};
   const auto i = static_cast<std::size_t>(std::max_element(parts.begin(), parts.end()) - parts.begin());
   std::array<double, 4> q;  // x, y, z, w

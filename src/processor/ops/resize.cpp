@@ -38,7 +38,7 @@ Status resize(const Frame& frame, const Resize& to, std::span<float> out, const 
 namespace {
 
 /// As the first op it writes the planes; after other ops it is one of several ops on bytes.
-Status parse(JsonFields& fields, Recipe& recipe) {
+Status parse_resize(JsonFields& fields, Recipe& recipe) {
   if (recipe.fit != nullptr) return parse_byte_resize(fields, recipe);
   VLA_TRY(const Resize op, read_resize(fields, "resize"));
   recipe.fit = std::make_unique<OneFit<Resize>>("resized", resize, op);
@@ -49,6 +49,6 @@ Status parse(JsonFields& fields, Recipe& recipe) {
 
 }  // namespace
 
-Ops resize_ops() { return {{"image", "resize", parse}}; }
+Ops resize_ops() { return {{"image", "resize", parse_resize}}; }
 
 }  // namespace vla

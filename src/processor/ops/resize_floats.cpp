@@ -63,7 +63,7 @@ Result<Resize> read_size(JsonFields& fields) {
 }
 
 /// Consecutive resize_floats ops form one fit. The first may name the only frame size that is accepted.
-Status parse(JsonFields& fields, Recipe& recipe) {
+Status parse_resize_floats(JsonFields& fields, Recipe& recipe) {
   FloatResizes* const before = recipe.fit != nullptr ? recipe.fit->float_resizes() : nullptr;
   if ((recipe.fit != nullptr && before == nullptr) || !recipe.image.empty() || (before != nullptr && before->crop))
     return misplaced(fields, "resize_floats as the first ops on images");
@@ -88,7 +88,7 @@ Status parse(JsonFields& fields, Recipe& recipe) {
 }
 
 /// Crops the centre of the resized image.
-Status parse_crop(JsonFields& fields, Recipe& recipe) {
+Status parse_crop_floats(JsonFields& fields, Recipe& recipe) {
   FloatResizes* const before = recipe.fit != nullptr ? recipe.fit->float_resizes() : nullptr;
   if (before == nullptr || before->crop || !recipe.image.empty())
     return misplaced(fields, "crop_floats once, behind resize_floats");
@@ -103,6 +103,8 @@ Status parse_crop(JsonFields& fields, Recipe& recipe) {
 
 }  // namespace
 
-Ops resize_floats_ops() { return {{"image", "resize_floats", parse}, {"image", "crop_floats", parse_crop}}; }
+Ops resize_floats_ops() {
+  return {{"image", "resize_floats", parse_resize_floats}, {"image", "crop_floats", parse_crop_floats}};
+}
 
 }  // namespace vla

@@ -17,7 +17,6 @@
 namespace vla {
 namespace {
 
-using Matrix = Matrix3<float>;
 using Axes = std::array<std::size_t, 3>;
 
 constexpr std::size_t kRows = 6;  // elements in the first two rows of a matrix
@@ -38,7 +37,7 @@ float arc_tangent(float y, float x) {
 }
 
 /// q: real part first, of any length.
-Matrix of_quaternion(const float* q) {
+Matrix3<float> of_quaternion(const float* q) {
   const float r = q[0], i = q[1], j = q[2], k = q[3];
   const float s = 2.0f / (r * r + i * i + j * j + k * k);
   return {1 - s * (j * j + k * k), s * (i * j - k * r),     s * (i * k + j * r),
@@ -47,15 +46,15 @@ Matrix of_quaternion(const float* q) {
 }
 
 /// v: axis times angle.
-Matrix of_axis_angle(const float* v) {
+Matrix3<float> of_axis_angle(const float* v) {
   const float angle = std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), half = angle * 0.5f;
   const float scale = angle < 1e-6f ? 0.5f - angle * angle / 48 : sine(half) / angle;
   const float quaternion[] = {cosine(half), v[0] * scale, v[1] * scale, v[2] * scale};
   return of_quaternion(quaternion);
 }
 
-Matrix around(std::size_t axis, float angle) {
-  Matrix out{};
+Matrix3<float> around(std::size_t axis, float angle) {
+  Matrix3<float> out{};
   const std::size_t j = (axis + 1) % 3, k = (axis + 2) % 3;
   out[4 * axis] = 1;
   out[4 * j] = out[4 * k] = cosine(angle);
@@ -64,8 +63,8 @@ Matrix around(std::size_t axis, float angle) {
   return out;
 }
 
-Matrix of_euler_angles(const Axes& axes, const float* angles) {
-  const Matrix first = product(around(axes[0], angles[0]), around(axes[1], angles[1]));
+Matrix3<float> of_euler_angles(const Axes& axes, const float* angles) {
+  const Matrix3<float> first = product(around(axes[0], angles[0]), around(axes[1], angles[1]));
   return product(first, around(axes[2], angles[2]));
 }
 
@@ -79,7 +78,7 @@ float outer_angle(std::size_t axis, std::size_t middle, const std::array<float, 
 }
 
 /// Writes three angles. The middle one is NaN if rounding makes its sine larger than 1, as in the reference.
-void write_euler_angles(const Axes& axes, const Matrix& m, std::span<double> out) {
+void write_euler_angles(const Axes& axes, const Matrix3<float>& m, std::span<double> out) {
   const auto [first, middle, last] = axes;
   const bool even = (first + 1) % 3 == middle;
   const float sine_of_middle = even ? m[3 * first + last] : -m[3 * first + last];
@@ -114,7 +113,7 @@ struct RotationStateOp final : StateOp {
   }
   Status finish(std::vector<float>& state, std::vector<int>&) const override {
     const auto place = state.begin() + column;
-    Matrix matrix = from == 0 ? of_quaternion(&*place) : from == 1 ? of_axis_angle(&*place) : of_euler(&*place);
+    Matrix3<float> matrix = from == 0 ? of_quaternion(&*place) : from == 1 ? of_axis_angle(&*place) : of_euler(&*place);
     if (!std::all_of(matrix.begin(), matrix.end(), [](float x) { return std::isfinite(x); }))
       return Error{Code::bad_observation, feature_, "a rotation",
                    fmt::format("numbers of none, the first of which is {}", *place)};
@@ -126,7 +125,7 @@ struct RotationStateOp final : StateOp {
   }
 
  private:
-  Matrix of_euler(const float* angles) const { return of_euler_angles(kEulerOrders[from - 2].axes, angles); }
+  Matrix3<float> of_euler(const float* angles) const { return of_euler_angles(kEulerOrders[from - 2].axes, angles); }
   std::string feature_;
 };
 
@@ -136,7 +135,7 @@ std::vector<const char*> euler_names() {
   return names;
 }
 
-Status parse_state(JsonFields& fields, Recipe& recipe) {
+Status parse_rotation_state(JsonFields& fields, Recipe& recipe) {
   const auto last = recipe.state.empty() ? StateOp::Stage::convention : recipe.state.back()->stage();
   if (last > StateOp::Stage::widened) return misplaced(fields, "rotation before pad");
   auto op = std::make_unique<RotationStateOp>();
@@ -167,7 +166,7 @@ struct RotationActionOp final : ActionOp {
   }
 };
 
-Status parse_action(JsonFields& fields, Recipe& recipe) {
+Status parse_rotation_action(JsonFields& fields, Recipe& recipe) {
   auto op = std::make_unique<RotationActionOp>();
   VLA_CHECK(fields.choice("from", {"axis_angle"}));
   VLA_TRY(const int order, fields.choice("to", euler_names()));
@@ -179,6 +178,8 @@ Status parse_action(JsonFields& fields, Recipe& recipe) {
 
 }  // namespace
 
-Ops rotation_ops() { return {{"state", "rotation", parse_state}, {"action", "rotation", parse_action}}; }
+Ops rotation_ops() {
+  return {{"state", "rotation", parse_rotation_state}, {"action", "rotation", parse_rotation_action}};
+}
 
 }  // namespace vla

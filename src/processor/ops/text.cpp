@@ -228,7 +228,7 @@ Status read(JsonFields& fields, ViewsOp& op, Recipe& recipe) {
 }
 
 template <class Op>
-Status parse(JsonFields& fields, Recipe& recipe) {
+Status parse_text(JsonFields& fields, Recipe& recipe) {
   constexpr bool is_template_op = std::is_same_v<Op, TemplateOp>;
   if (recipe.max_tokens > 0) return misplaced(fields, "nothing after tokenize");
   if (recipe.views != nullptr && (!is_template_op || recipe.text.back().get() != recipe.views))
@@ -268,16 +268,16 @@ Status parse_tokenize(JsonFields& fields, Recipe& recipe) {
 }  // namespace
 
 Ops text_ops() {
-  return {{"text", "strip", parse<EditOp<stripped>>},
-          {"text", "lower", parse<EditOp<python::lower>>},
-          {"text", "drop_punctuation", parse<EditOp<python::drop_punctuation>>},
-          {"text", "replace", parse<ReplaceOp>},
-          {"text", "refuse", parse<RefuseOp>},
-          {"text", "if_empty", parse<IfEmptyOp>},
-          {"text", "python_list", parse<PythonListOp>},
-          {"text", "ensure_suffix", parse<EnsureSuffixOp>},
-          {"text", "template", parse<TemplateOp>},
-          {"text", "views", parse<ViewsOp>},
+  return {{"text", "strip", parse_text<EditOp<stripped>>},
+          {"text", "lower", parse_text<EditOp<python::lower>>},
+          {"text", "drop_punctuation", parse_text<EditOp<python::drop_punctuation>>},
+          {"text", "replace", parse_text<ReplaceOp>},
+          {"text", "refuse", parse_text<RefuseOp>},
+          {"text", "if_empty", parse_text<IfEmptyOp>},
+          {"text", "python_list", parse_text<PythonListOp>},
+          {"text", "ensure_suffix", parse_text<EnsureSuffixOp>},
+          {"text", "template", parse_text<TemplateOp>},
+          {"text", "views", parse_text<ViewsOp>},
           {"text", "limit", parse_limit},
           {"text", "tokenize", parse_tokenize}};
 }
