@@ -14,21 +14,21 @@ std::int64_t count_keys(const AttentionOp& op) {
 
 /// Cost model of attention, in microseconds and rates per microsecond, fitted to 218 measurements on an H200 (every
 /// shape and number of shares for 13 sizes of four policies; 85 % of the estimates are within 25 % of the measurement).
-struct Rates {
+struct AttentionRates {
   double tile;      // time of a tile of keys, without its products
   double products;  // rate of a block: query rows x keys x elements of a head
   double further;   // the fraction of a block's time that each further block on an SM adds
 };
-constexpr Rates kOneGroup = {.tile = 0.43, .products = 300e3, .further = 0.38},
-                kSharedKeys = {.tile = 1.5, .products = 750e3, .further = 0.83};
-/// kBegin: time to start a block, with its first loads. kFinish: time of the kernel that combines shares of the keys.
-constexpr double kBegin = 2.9, kFinish = 2.7;
+constexpr AttentionRates kOneGroup = {.tile = 0.43, .products = 300e3, .further = 0.38},
+                         kSharedKeys = {.tile = 1.5, .products = 750e3, .further = 0.83};
+/// kStart: time to start a block, with its first loads. kCombine: time of the kernel that combines shares of the keys.
+constexpr double kStart = 2.9, kCombine = 2.7;
 /// Bytes of partial sums that one SM moves per microsecond.
 constexpr double kPartial = 12.4e3;
 
 double microseconds(const cuda::AttentionShape& shape, std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit,
                     std::int64_t n_key, std::int64_t n_split, int n_sm) {
-  const Rates& rates = shape.key_groups > 1 ? kSharedKeys : kOneGroup;
+  const AttentionRates& rates = shape.key_groups > 1 ? kSharedKeys : kOneGroup;
   const std::int64_t n_block = (n_row + shape.rows - 1) / shape.rows * n_unit * n_split;
   const std::int64_t share = (n_key + n_split - 1) / n_split, n_tile = (share + shape.keys - 1) / shape.keys;
   const double products = static_cast<double>(shape.rows) * shape.keys * shape.depth;
@@ -36,8 +36,8 @@ double microseconds(const cuda::AttentionShape& shape, std::int64_t d_head, std:
   const double each = 1 + rates.further * static_cast<double>((n_block + n_sm - 1) / n_sm - 1);
   const double finish =
       n_split == 1 ? 0
-                   : kFinish + 8.0 * static_cast<double>((d_head + 2) * n_row * n_unit * n_split) / (kPartial * n_sm);
-  return kBegin + each * block + finish;
+                   : kCombine + 8.0 * static_cast<double>((d_head + 2) * n_row * n_unit * n_split) / (kPartial * n_sm);
+  return kStart + each * block + finish;
 }
 
 }  // namespace

@@ -11,7 +11,7 @@ namespace vla::lower {
 namespace {
 
 /// Cost model of a product, in microseconds and rates per microsecond.
-struct Rates {
+struct ProductRates {
   double sums;           // results of a block that advance by one step of the depth
   double of_sm;          // bytes that an SM reads from the L2 cache
   double least;          // minimum time of a step of the depth
@@ -23,33 +23,33 @@ struct Rates {
 // Fitted to measurements on an H200: bf16 to 930 products of 50 to 2048 rows with float32 results, int8 to 194 and
 // ternary to 408; 96, 96 and 89 % of the estimates are within a sixth of the measurement. The chosen tile takes at most
 // 1.19 times as long as the best one.
-constexpr Rates kBf16 = {.sums = 42.7e3,
-                         .of_sm = 67.1e3,
-                         .least = 0.267,
-                         .kernel = 1.57,
-                         .block = 0.44,
-                         .first_end = 0,
-                         .end = 1.46e-4,
-                         .share = 5.1e-5,
-                         .further = 0.97};
-constexpr Rates kTernary = {.sums = 34.2e3,
-                            .of_sm = 65e3,
-                            .least = 0.192,
-                            .kernel = 3.78,
-                            .block = 0.03,
-                            .first_end = 0.2,
-                            .end = 2.6e-4,
-                            .share = 9e-6,
-                            .further = 1.21};
-constexpr Rates kInt8 = {.sums = 51.6e3,
-                         .of_sm = 52.6e3,
-                         .least = 0.168,
-                         .kernel = 2.35,
-                         .block = 0.13,
-                         .first_end = 0.35,
-                         .end = 3.4e-4,
-                         .share = 3.5e-5,
-                         .further = 1.18};
+constexpr ProductRates kBf16 = {.sums = 42.7e3,
+                                .of_sm = 67.1e3,
+                                .least = 0.267,
+                                .kernel = 1.57,
+                                .block = 0.44,
+                                .first_end = 0,
+                                .end = 1.46e-4,
+                                .share = 5.1e-5,
+                                .further = 0.97};
+constexpr ProductRates kTernary = {.sums = 34.2e3,
+                                   .of_sm = 65e3,
+                                   .least = 0.192,
+                                   .kernel = 3.78,
+                                   .block = 0.03,
+                                   .first_end = 0.2,
+                                   .end = 2.6e-4,
+                                   .share = 9e-6,
+                                   .further = 1.21};
+constexpr ProductRates kInt8 = {.sums = 51.6e3,
+                                .of_sm = 52.6e3,
+                                .least = 0.168,
+                                .kernel = 2.35,
+                                .block = 0.13,
+                                .first_end = 0.35,
+                                .end = 3.4e-4,
+                                .share = 3.5e-5,
+                                .further = 1.18};
 constexpr double kWritten = 2.5e6;  // bytes that all SMs together write to memory per microsecond
 
 /// A tile of a table, and the bytes that it reads per step of 128 bytes of depth.
@@ -84,7 +84,7 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
                           HopperCutFor what, int n_sm) {
   const bool is_bf16 = kind == MatrixKind::bf16;
   const std::int64_t n_step = ceil_of(depth, is_bf16 ? cuda::kHopperDepth : cuda::kHopperInt8Depth);
-  const Rates& rates = is_bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
+  const ProductRates& rates = is_bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
   ProductCut best = {ProductShape::hopper, 1, 0, std::numeric_limits<double>::max()};
   for (const Candidate& tile : candidates(kind, what))
     for (const int n_split : {1, 2, 3, 4, 6, 8}) {
