@@ -14,6 +14,8 @@
 #include <cstdlib>
 #include <filesystem>
 
+namespace file_test {
+
 using namespace vla;
 namespace fs = std::filesystem;
 
@@ -182,3 +184,5 @@ TEST_CASE("what cannot be read or written is an io error that names the path, an
   CHECK(written.error().code == Code::io);
   CHECK(folder.n_entry() == 2);
 }
+
+}  // namespace file_test

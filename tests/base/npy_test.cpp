@@ -6,6 +6,8 @@
 
 #include "support/editable_bundle.h"
 
+namespace npy_test {
+
 using namespace vla;
 
 namespace {
@@ -43,3 +45,5 @@ TEST_CASE("arrays of other types, orders and damaged headers are refused") {
         "{'descr': '|u1', 'fortran_order': False, 'shape': (99999999999, 99999999999, 99999999999)}", "{}", ""})
     CHECK_FALSE(parse(npy(header, "abcd")).ok());
 }
+
+}  // namespace npy_test

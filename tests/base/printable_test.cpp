@@ -4,6 +4,8 @@
 
 #include <doctest/doctest.h>
 
+namespace printable_test {
+
 using namespace vla;
 
 TEST_CASE("letters of all languages are printed as they are") {
@@ -28,3 +30,5 @@ TEST_CASE("bytes that are no UTF-8 are printed one by one") {
   CHECK(printable("\xf4\x90\x80\x80") == "\\xf4\\x90\\x80\\x80");  // beyond the last character
   CHECK_FALSE(is_printable("ok\xff"));
 }
+
+}  // namespace printable_test

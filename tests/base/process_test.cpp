@@ -4,6 +4,8 @@
 
 #include <doctest/doctest.h>
 
+namespace process_test {
+
 using namespace vla;
 
 TEST_CASE("memory that a process could take is what the system and its group leave") {
@@ -19,3 +21,5 @@ TEST_CASE("a process takes memory, and less than all of it is left") {
   CHECK(resident_size() > 0);
   CHECK(free_memory() > 0);
 }
+
+}  // namespace process_test

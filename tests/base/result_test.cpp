@@ -4,6 +4,8 @@
 
 #include <doctest/doctest.h>
 
+namespace result_test {
+
 using namespace vla;
 
 TEST_CASE("the message of an error says what was found, also where that is an empty text") {
@@ -13,3 +15,5 @@ TEST_CASE("the message of an error says what was found, also where that is an em
   CHECK(Error{Code::usage, "vla.arch", "pi0", "evo1"}.found == "evo1");
   CHECK(Error{Code::internal, "act", "", "an exception"}.message() == "act: an exception");
 }
+
+}  // namespace result_test

@@ -8,6 +8,8 @@
 
 #include <fstream>
 
+namespace thread_test {
+
 using namespace vla;
 
 TEST_CASE("a thread that the system does not give is an error, and the next one runs") {
@@ -44,3 +46,5 @@ TEST_CASE("signals are not delivered to a thread") {
   pthread_sigmask(SIG_BLOCK, nullptr, &own);
   CHECK(sigismember(&own, SIGTERM) == 0);
 }
+
+}  // namespace thread_test

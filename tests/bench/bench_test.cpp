@@ -13,6 +13,8 @@
 #include "policies/policy.h"
 #include "support/editable_bundle.h"
 
+namespace bench_test {
+
 using namespace vla;
 using namespace vla::bench;
 
@@ -245,3 +247,5 @@ TEST_CASE("a rate is held while a chunk lasts until the next one is there") {
   checkup.rate_hz = 0, checkup.one_thread = 0;
   CHECK(checkup.holds_rate());
 }
+
+}  // namespace bench_test

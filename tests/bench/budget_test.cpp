@@ -15,6 +15,8 @@
 #include "policies/policy.h"
 #include "support/published.h"
 
+namespace budget_test {
+
 using namespace vla;
 
 namespace {
@@ -132,3 +134,5 @@ TEST_CASE("the least memory that a published policy is told to need suffices for
       if (is_tried(entry.name, stored)) check_on_each_device(entry, stored);
     }
 }
+
+}  // namespace budget_test

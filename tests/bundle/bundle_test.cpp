@@ -13,6 +13,8 @@
 #include "bundle/params.h"
 #include "support/editable_bundle.h"
 
+namespace bundle_test {
+
 using namespace vla;
 using test::EditableBundle;
 
@@ -310,3 +312,5 @@ TEST_CASE("a text that is shown is at most 4096 bytes long, and a vocabulary as 
   bundle.set("tokenizer.pre", Value(std::string(5000, 'x')));
   CHECK(parse(bundle.bytes()).ok());
 }
+
+}  // namespace bundle_test

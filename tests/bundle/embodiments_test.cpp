@@ -8,6 +8,8 @@
 #include "bundle/params.h"
 #include "support/editable_bundle.h"
 
+namespace embodiments_test {
+
 using namespace vla;
 using test::EditableBundle;
 
@@ -217,3 +219,5 @@ TEST_CASE("a tensor of a further robot that no module declares is refused, and s
   CHECK(contains(report.error().message(), "unused tensor   stats.x"));
   CHECK(contains(report.error().message(), "wrong shape     lm.weight"));
 }
+
+}  // namespace embodiments_test

@@ -8,6 +8,8 @@
 
 #include "capi/policy.h"
 
+namespace act_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -157,3 +159,5 @@ TEST_CASE("policies are opened and act at the same time without touching each ot
   for (std::thread& thread : threads) thread.join();
   CHECK(n_same == 3 * static_cast<int>(paths.size()));
 }
+
+}  // namespace act_test

@@ -9,6 +9,8 @@
 
 #include "capi/policy.h"
 
+namespace refusal_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -258,3 +260,5 @@ TEST_CASE("an error belongs to its thread and to its policy") {
   CHECK(vla_last_error(nullptr)->code == VLA_OK);
   CHECK(std::string(vla_last_error(nullptr)->code_name) == "ok");
 }
+
+}  // namespace refusal_test

@@ -10,6 +10,8 @@
 #include "cuda/machine.h"
 #include "cuda/numbers.h"
 
+namespace attention_test {
+
 using namespace vla;
 using namespace vla::cuda;
 using namespace vla::test::cuda;
@@ -166,3 +168,5 @@ TEST_CASE("attention in float32 is within 2e-6 of doubles") {
     });
   }
 }
+
+}  // namespace attention_test

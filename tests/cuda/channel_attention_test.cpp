@@ -9,6 +9,8 @@
 #include "cuda/machine.h"
 #include "cuda/numbers.h"
 
+namespace channel_attention_test {
+
 using namespace vla::cuda;
 using namespace vla::test::cuda;
 
@@ -67,3 +69,5 @@ TEST_CASE("features attend to those of their group, of any number of tokens, gro
     });
   }
 }
+
+}  // namespace channel_attention_test

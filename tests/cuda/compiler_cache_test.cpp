@@ -11,6 +11,8 @@
 #include <map>
 #include <optional>
 
+namespace compiler_cache_test {
+
 using vla::cuda::compiler_cache;
 
 namespace {
@@ -69,3 +71,5 @@ TEST_CASE_FIXTURE(Bare, "a folder that others may write to, or that is a link, k
   std::filesystem::create_directory_symlink(folder, own());
   CHECK(compiler_cache().empty());
 }
+
+}  // namespace compiler_cache_test

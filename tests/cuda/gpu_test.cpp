@@ -11,6 +11,8 @@
 #include "cuda/kernels/rows.h"
 #include "cuda/machine.h"
 
+namespace gpu_test {
+
 using namespace vla;
 using namespace vla::cuda;
 using namespace vla::test::cuda;
@@ -257,3 +259,5 @@ TEST_CASE("without NVIDIA's driver there is a device error, not a crash") {
   CHECK(driver.error().code == Code::device);
   CHECK(driver.error().message().find("libcuda.so.1") != std::string::npos);
 }
+
+}  // namespace gpu_test

@@ -6,6 +6,8 @@
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/products.h"
 
+namespace hopper_linear_test {
+
 using namespace vla;
 using namespace vla::cuda;
 using namespace vla::test::cuda;
@@ -105,3 +107,5 @@ TEST_CASE("several products in tiles for Hopper are what each is alone, to the b
       });
     }
 }
+
+}  // namespace hopper_linear_test

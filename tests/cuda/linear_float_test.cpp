@@ -6,6 +6,8 @@
 #include "cuda/kernels/linear_f32.h"
 #include "cuda/products.h"
 
+namespace linear_float_test {
+
 using namespace vla;
 using namespace vla::cuda;
 using namespace vla::test::cuda;
@@ -142,3 +144,5 @@ TEST_CASE("float32 products are within 2e-6 of doubles") {
     });
   }
 }
+
+}  // namespace linear_float_test

@@ -13,6 +13,8 @@
 #include "bundle/encoding.h"
 #include "cuda/machine.h"
 
+namespace linear_int8_test {
+
 using namespace vla;
 using namespace vla::cuda;
 using namespace vla::test::cuda;
@@ -199,3 +201,5 @@ TEST_CASE("int8 products in tiles for Hopper are equal to the same bits") {
     }
   CHECK(counts.bank_conflicts == 0);
 }
+
+}  // namespace linear_int8_test

@@ -11,6 +11,8 @@
 #include "cuda/machine_kernels.h"
 #include "cuda/ptx.h"
 
+namespace machine_test {
+
 using namespace vla;
 using namespace vla::test::cuda;
 
@@ -224,3 +226,5 @@ TEST_CASE("fragments of products are those of plain sums") {
       REQUIRE(static_cast<int>(to[c][lane]) == expected + static_cast<int>(sum[c][lane]));
     }
 }
+
+}  // namespace machine_test

@@ -14,6 +14,8 @@
 #include "lower/cuda/cuda_device.h"
 #include "support/golden_case.h"
 
+namespace policy_test {
+
 using namespace vla;
 using namespace vla::test;
 using test::cuda::fake_driver;
@@ -371,3 +373,5 @@ TEST_CASE_FIXTURE(Driver, "a model of a GPU says how long an act takes there: lo
   REQUIRE(!absent.ok());
   CHECK(absent.error().expected == "one of orin-agx, rtx-3060, rtx-5090, h100, h200");
 }
+
+}  // namespace policy_test

@@ -13,6 +13,8 @@
 #include "kernels/portable/vec_portable.h"
 #include "kernels/quantized.h"
 
+namespace rows_test {
+
 using namespace vla;
 using namespace vla::cuda;
 using namespace vla::test::cuda;
@@ -313,3 +315,5 @@ TEST_CASE("patches of images are rows of channel, row and column") {
   launch(how, parts);
   CHECK(in_parts.host() == expected);
 }
+
+}  // namespace rows_test

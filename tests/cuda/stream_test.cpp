@@ -19,6 +19,8 @@
 #include "lower/cuda/cuda_device.h"
 #include "support/golden_case.h"
 
+namespace stream_test {
+
 using namespace vla;
 using namespace vla::test;
 using test::cuda::fake_driver;
@@ -233,3 +235,5 @@ TEST_CASE_FIXTURE(Driver,
         if (symbol.starts_with(copies)) CHECK(!status.ok());
     }
 }
+
+}  // namespace stream_test

@@ -7,6 +7,8 @@
 #include "cuda/machine.h"
 #include "cuda/numbers.h"
 
+namespace window_test {
+
 using namespace vla;
 using namespace vla::cuda;
 using namespace vla::test::cuda;
@@ -131,3 +133,5 @@ TEST_CASE("the weighted sum of a window has its own weights for each feature and
     }
   }
 }
+
+}  // namespace window_test

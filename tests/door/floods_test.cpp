@@ -7,6 +7,8 @@
 #include <algorithm>
 #include <string>
 
+namespace floods_test {
+
 using namespace vla;
 using door::Floods;
 
@@ -93,3 +95,5 @@ TEST_CASE("frames are found wherever the bytes are cut") {
     CHECK(at + 400 + piece > bytes.size());  // the last of them
   }
 }
+
+}  // namespace floods_test

@@ -10,6 +10,8 @@
 
 #include "net/loop.h"
 
+namespace rpcs_test {
+
 using namespace vla;
 using namespace std::chrono_literals;
 
@@ -65,3 +67,5 @@ TEST_CASE("once stopped it takes no connection, while the loop goes on for answe
   rpcs.end();
   for (const int open : {first, second, never}) ::close(open);
 }
+
+}  // namespace rpcs_test

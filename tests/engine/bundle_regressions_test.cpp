@@ -9,6 +9,8 @@
 #include "fuzz/bundle_target.h"
 #include "support/joint_bundle.h"
 
+namespace bundle_regressions_test {
+
 using namespace vla;
 using namespace vla::test;
 using fuzz::Depth;
@@ -77,3 +79,5 @@ TEST_CASE("bundles from fuzzing load or are refused") {
   }
   CHECK(count > 0);
 }
+
+}  // namespace bundle_regressions_test

@@ -14,6 +14,8 @@
 #include "support/graph_runner.h"
 #include "support/param_set.h"
 
+namespace decoder_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -135,3 +137,5 @@ TEST_CASE("logits token by token are those of all tokens at once, whatever an ea
     }
   }
 }
+
+}  // namespace decoder_test

@@ -7,6 +7,8 @@
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
 
+namespace description_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -36,3 +38,5 @@ TEST_CASE("a robot that gets the first rows and columns only: the chunk is small
   CHECK(d.d_action_padded == 11);
   CHECK(d.states.size() == 7);
 }
+
+}  // namespace description_test

@@ -10,6 +10,8 @@
 #include "support/golden_case.h"
 #include "support/joint_bundle.h"
 
+namespace embodiments_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -129,3 +131,5 @@ TEST_CASE("a bundle of several robots is not loaded as one of them unless it is 
   CHECK(engine.error().code == Code::usage);
   CHECK(engine.error().expected == "one of arm, dog");
 }
+
+}  // namespace embodiments_test

@@ -11,6 +11,8 @@
 #include "kernels/kernel_set.h"
 #include "support/golden_case.h"
 
+namespace golden_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -184,3 +186,5 @@ TEST_CASE("a second request, and one after a request of another shape, give the 
     CHECK(engine->act(golden.observation, golden.noise)->actions == first->actions);
   }
 }
+
+}  // namespace golden_test

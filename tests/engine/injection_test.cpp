@@ -11,6 +11,8 @@
 #include "kernels/kernel_set.h"
 #include "support/golden_case.h"
 
+namespace injection_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -166,3 +168,5 @@ TEST_CASE("what cannot be injected is refused by name") {
   REQUIRE(!engine.ok());
   CHECK(contains(engine.error().message(), "injected chunk"));
 }
+
+}  // namespace injection_test

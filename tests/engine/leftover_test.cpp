@@ -12,6 +12,8 @@
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
 
+namespace leftover_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -165,3 +167,5 @@ TEST_CASE("rows in world units are noted, and refused where a state would be") {
   CHECK(refused.error().code == Code::bad_observation);
   CHECK(refused.error().where == "leftover");
 }
+
+}  // namespace leftover_test

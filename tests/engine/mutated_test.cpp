@@ -10,6 +10,8 @@
 #include "support/editable_bundle.h"
 #include "support/joint_bundle.h"
 
+namespace mutated_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -47,3 +49,5 @@ TEST_CASE("an odd bundle for two robots lets both act, or is refused") {
   CHECK(n_answered > 0);
   CHECK(n_answered < kRounds);
 }
+
+}  // namespace mutated_test

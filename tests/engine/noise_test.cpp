@@ -7,6 +7,8 @@
 #include <algorithm>
 #include <cmath>
 
+namespace noise_test {
+
 using namespace vla;
 
 TEST_CASE("seed 1 gives these values on every machine") {
@@ -39,3 +41,5 @@ TEST_CASE("uniform noise stays within [-1, 1) and reaches both ends") {
 }
 
 TEST_CASE("another kind of noise is a bad bundle") { CHECK(draw_noise("pink", 1, 4).error().code == Code::bad_bundle); }
+
+}  // namespace noise_test

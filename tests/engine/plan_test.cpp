@@ -4,6 +4,8 @@
 
 #include "support/weightless.h"
 
+namespace plan_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -28,3 +30,5 @@ TEST_CASE("the plans of all robots together stay within one limit, and give way 
   CHECK(plans.find(one, first) == nullptr);
   CHECK(plans.size() == largest);  // of the plan that the others gave way to
 }
+
+}  // namespace plan_test

@@ -15,6 +15,8 @@
 
 #include <doctest/doctest.h>
 
+namespace position_rule_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -95,3 +97,5 @@ TEST_CASE("with another rule than the reference's the actions are displaced, how
     CHECK(mismatched > 100 * matched);
   }
 }
+
+}  // namespace position_rule_test

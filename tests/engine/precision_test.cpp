@@ -11,6 +11,8 @@
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
 
+namespace precision_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -112,3 +114,5 @@ TEST_CASE("an engine tells that matrices were quantized, as somebody asked") {
   CHECK(engine->arithmetic().find("as asked") != std::string::npos);
   CHECK(!engine->has_ternary());
 }
+
+}  // namespace precision_test

@@ -12,6 +12,8 @@
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
 
+namespace refusal_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -309,3 +311,5 @@ TEST_CASE("a seed gives the same bytes every time and another seed others") {
   CHECK(first->actions == engine->act(golden.observation, std::uint64_t{7})->actions);
   CHECK(first->actions != engine->act(golden.observation, std::uint64_t{8})->actions);
 }
+
+}  // namespace refusal_test

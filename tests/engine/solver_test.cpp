@@ -7,6 +7,8 @@
 #include "nn/embedding.h"
 #include "support/graph_runner.h"
 
+namespace solver_test {
+
 using namespace vla;
 
 namespace {
@@ -211,3 +213,5 @@ TEST_CASE("a direct head answers the chunk in one pass, from no noise") {
   CHECK(many.error().message().find("solver.steps") != std::string::npos);
   CHECK(noisy.error().message().find("solver.noise") != std::string::npos);
 }
+
+}  // namespace solver_test

@@ -9,6 +9,8 @@
 #include <cmath>
 #include <filesystem>
 
+namespace taps_test {
+
 using namespace vla;
 
 TEST_CASE("taps of one path are told apart in a file") {
@@ -74,3 +76,5 @@ TEST_CASE("another shape and a number that is not finite are within no tolerance
   infinite.values[4] = INFINITY;
   for (const Tap& got : {turned, infinite}) CHECK_FALSE(compare_taps({expected}, {got}).front().within(1e9));
 }
+
+}  // namespace taps_test

@@ -11,6 +11,8 @@
 #include "support/golden_case.h"
 #include "support/joint_bundle.h"
 
+namespace threads_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -54,3 +56,5 @@ TEST_CASE("while one thread acts two others prepare for either robot, and no ans
     REQUIRE(dog.ok());
   }
 }
+
+}  // namespace threads_test

@@ -5,6 +5,8 @@
 #include "kernels/kernel_set.h"
 #include "support/weightless.h"
 
+namespace work_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -67,3 +69,5 @@ TEST_CASE("the published SmolVLA counts the operations of its configuration, und
   const Expected published = count_by_hand(2, 48);  // the reference computes 593: a whole last layer, keys in each step
   CHECK((published.vision + published.prefix + 10 * published.step) * 1e-9 == doctest::Approx(590).epsilon(0.001));
 }
+
+}  // namespace work_test

@@ -7,6 +7,8 @@
 
 #include <doctest/doctest.h>
 
+namespace graph_test {
+
 using namespace vla;
 
 namespace {
@@ -224,3 +226,5 @@ TEST_CASE("what one graph leaves in the cache is the value itself there, and an 
   CHECK(got.shape() == y.shape());
   CHECK(got.node()->as<op::Input>() != nullptr);
 }
+
+}  // namespace graph_test

@@ -8,6 +8,8 @@
 #include "support/graph_runner.h"
 #include "support/param_set.h"
 
+namespace work_test {
+
 using namespace vla;
 using test::GraphRunner;
 using test::ParamSet;
@@ -95,3 +97,5 @@ TEST_CASE("a program splits its work and its times at the graph's stages, and le
     CHECK(program.stages()[0].done <= std::chrono::steady_clock::now());
   }
 }
+
+}  // namespace work_test

@@ -9,6 +9,8 @@
 #include "support/attention_case.h"
 #include "support/kernel_rows.h"
 
+namespace attention_pairs_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -157,3 +159,5 @@ VLA_PAIR_TEST("attention reads rounded queries, keys and values as it rounds the
 VLA_PAIR_TEST("attention skips what a mask hides, and chunks that it hides whole", check_pair_masks)
 VLA_PAIR_TEST("a query that sees nothing, and what is not finite, does not become an answer",
               check_attention_of_not_finite)
+
+}  // namespace attention_pairs_test

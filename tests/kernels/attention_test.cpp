@@ -5,6 +5,8 @@
 #include "support/attention_case.h"
 #include "support/kernel_rows.h"
 
+namespace attention_test {
+
 using namespace vla;
 using namespace vla::test;
 using kernels::CpuKernels;
@@ -144,3 +146,5 @@ TEST_CASE("ggml: a key with the logarithm of n in the mask is as n equal keys") 
       CHECK(worst_error(r.all, run_plain(r.one)) <= 1e-5);
     }
 }
+
+}  // namespace attention_test

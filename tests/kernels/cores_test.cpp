@@ -9,6 +9,8 @@
 #include <fstream>
 #include <thread>
 
+namespace cores_test {
+
 using namespace vla::kernels;
 
 namespace {
@@ -58,3 +60,5 @@ TEST_CASE("a thread stays on the cores that it is given, and others do not") {
   CHECK(inside == Cores{before.back()});
   CHECK(allowed_cores() == before);
 }
+
+}  // namespace cores_test

@@ -7,6 +7,8 @@
 #include <set>
 #include <thread>
 
+namespace executor_test {
+
 using namespace vla;
 using namespace vla::test;
 using kernels::Executor;
@@ -207,3 +209,5 @@ TEST_CASE("a worker that is held up in an item does not keep others from the res
   executor->run(std::span(&phase, 1));
   CHECK(done_by_others == 39);
 }
+
+}  // namespace executor_test

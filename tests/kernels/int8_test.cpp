@@ -18,6 +18,8 @@
 #include "support/product.h"
 #include "support/stored.h"
 
+namespace int8_test {
+
 using namespace vla;
 using namespace vla::kernels;
 
@@ -457,3 +459,5 @@ VLA_INT8_TEST("the largest sums are exact", check_extremes)
 VLA_INT8_TEST("bias, gate and residual follow the product, each rounded by itself", check_epilogues)
 VLA_INT8_TEST("any number of threads computes every number once, and the same", check_threads)
 VLA_INT8_TEST("a row that is not finite has no finite product", check_not_finite)
+
+}  // namespace int8_test

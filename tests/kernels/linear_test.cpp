@@ -15,6 +15,8 @@
 #include "support/product.h"
 #include "support/stored.h"
 
+namespace linear_test {
+
 using namespace vla;
 using namespace vla::kernels;
 
@@ -416,3 +418,5 @@ TEST_CASE("x is rounded to the nearest bf16, ties to even, as PyTorch rounds it"
   CHECK(std::isnan(from_bf16(to_bf16(std::numeric_limits<float>::quiet_NaN()))));
   CHECK(std::isnan(from_bf16(to_bf16(std::bit_cast<float>(0x7f800001U)))));  // rounding would make it infinite
 }
+
+}  // namespace linear_test

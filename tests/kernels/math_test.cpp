@@ -11,6 +11,8 @@
 #include "kernels/portable/vec_portable.h"
 #include "support/kernel_rows.h"
 
+namespace math_test {
+
 using namespace vla;
 using kernels::CpuKernels;
 
@@ -133,3 +135,5 @@ TEST_CASE("activations that are rounded to bf16 next err by 2^-13 of the result 
                                      std::pair(kernels::gelu_erf_for_bf16<V>(V::set(x))[0], gelu_erf(x))})
       if (!(std::abs(got - exact) <= 0x1p-13 * std::abs(exact) + 0x1p-119)) FAIL_CHECK(x << ": " << got);
 }
+
+}  // namespace math_test

@@ -9,6 +9,8 @@
 #include "support/graph_runner.h"
 #include "support/kernel_rows.h"
 
+namespace norm_test {
+
 using namespace vla;
 using kernels::CpuKernels;
 using test::ramp;
@@ -96,3 +98,5 @@ VLA_KERNEL_TEST("layer and RMS norms of any width agree with their definitions",
 
 VLA_KERNEL_TEST("sums, products and multiples of rows of any length, in place too", check_pairs_of_rows)
 VLA_KERNEL_TEST("pairs of a row turn by the angles of a table, in place too", check_rotation)
+
+}  // namespace norm_test

@@ -6,6 +6,8 @@
 
 #include <doctest/doctest.h>
 
+namespace probe_test {
+
 using namespace vla;
 using namespace vla::kernels;
 
@@ -34,3 +36,5 @@ TEST_CASE("memory is read at a rate that a machine can have") {
   CHECK(rate > 1e5);
   CHECK(rate < 1e13);
 }
+
+}  // namespace probe_test

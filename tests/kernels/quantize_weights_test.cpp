@@ -10,6 +10,8 @@
 
 #include "support/stored.h"
 
+namespace quantize_weights_test {
+
 using namespace vla;
 using namespace vla::kernels;
 
@@ -194,3 +196,5 @@ TEST_CASE("int4 with feedback: rows of zeros and of weights that are not finite"
   for (const Int4& row : got)
     for (std::size_t k = 0; k < 64; ++k) CHECK(row.blocks[0][static_cast<std::int64_t>(k)] == 0);
 }
+
+}  // namespace quantize_weights_test

@@ -4,6 +4,8 @@
 
 #include <doctest/doctest.h>
 
+namespace arithmetic_test {
+
 using namespace vla;
 
 namespace {
@@ -94,3 +96,5 @@ TEST_CASE("features that other features imply are never there without them") {
   CHECK(this_cpu().has(Feature::amx_bf16) >= this_cpu().has(Feature::amx_int8));
   CHECK(this_cpu().has(Feature::dotprod) >= this_cpu().has(Feature::i8mm));
 }
+
+}  // namespace arithmetic_test

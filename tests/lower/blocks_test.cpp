@@ -7,6 +7,8 @@
 #include "nn/linear.h"
 #include "support/kernel_rows.h"
 
+namespace blocks_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -94,3 +96,5 @@ TEST_CASE("amx: rows stay whole where blocks do not pay" * doctest::skip(lacks(k
   CHECK_FALSE(blocks(kInner, 1024, 2));  // the L2 cache keeps them all
   CHECK_FALSE(blocks(4128, 300, 1));     // too few rows of such a width
 }
+
+}  // namespace blocks_test

@@ -8,6 +8,8 @@
 #include "lower_case.h"
 #include "support/kernel_rows.h"
 
+namespace fuse_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -148,3 +150,5 @@ TEST_CASE("a product takes a window only where nobody else reads what it covers"
   CHECK(text(true, false).find("unfold, linear") == std::string::npos);
   CHECK(text(false, true).find("unfold, linear") == std::string::npos);
 }
+
+}  // namespace fuse_test

@@ -12,6 +12,8 @@
 
 #include "ggml/ggml_device.h"
 
+namespace ggml_guard_test {
+
 using namespace vla;
 
 namespace {
@@ -83,3 +85,5 @@ TEST_CASE("a device that failed once answers every later call with that error, a
   CHECK_FALSE(called);
   opened->reset();
 }
+
+}  // namespace ggml_guard_test

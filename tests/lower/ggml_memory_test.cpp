@@ -9,6 +9,8 @@
 
 #include "devices/devices.h"
 
+namespace ggml_memory_test {
+
 using namespace vla;
 
 namespace {
@@ -73,3 +75,5 @@ TEST_CASE("names of devices") {
     CHECK(DeviceName::parse(name).error().code == Code::usage);
   }
 }
+
+}  // namespace ggml_memory_test

@@ -9,6 +9,8 @@
 #include "chain.h"
 #include "ggml/ggml_device.h"
 
+namespace ggml_stream_test {
+
 using namespace vla;
 using test::Chain;
 
@@ -48,3 +50,5 @@ TEST_CASE("matrices of every type that come through a backend's windows give the
     for (int seed = 0; seed < 4; ++seed) CHECK(streamed.run(seed) == resident.run(seed));
   }
 }
+
+}  // namespace ggml_stream_test

@@ -4,6 +4,8 @@
 // Every operation of graph/op.h on awkward shapes and strides, lowered for the CPU and as plain ggml operations.
 #include "lower_case.h"
 
+namespace ops_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -393,3 +395,5 @@ TEST_CASE("one graph has every operation there is, and gives the same on all ker
     CHECK(recorded[i]);
   }
 }
+
+}  // namespace ops_test

@@ -6,6 +6,8 @@
 
 #include <cstring>
 
+namespace packing_test {
+
 using namespace vla;
 using namespace vla::lower;
 
@@ -58,3 +60,5 @@ TEST_CASE("a matrix of codes is packed in parts, with a scale a row behind it") 
   CHECK(Codes(DType::i8, by_row).packed_scales() == by_row);
   CHECK(Codes(DType::ternary, {0.25f}).packed_scales() == std::vector<float>(kRows, 0.25f));
 }
+
+}  // namespace packing_test

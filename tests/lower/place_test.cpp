@@ -8,6 +8,8 @@
 
 #include "lower_case.h"
 
+namespace place_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -274,3 +276,5 @@ VLA_SLOT_TEST("programs of one device share working memory, whichever is lowered
   REQUIRE((*first)->run().ok());  // without another prepare: what it left is the program's own
   CHECK((*device)->Device::get(*y) == alone);
 }
+
+}  // namespace place_test

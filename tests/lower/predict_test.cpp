@@ -6,6 +6,8 @@
 #include "lower_case.h"
 #include "nn/linear.h"
 
+namespace predict_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -86,3 +88,5 @@ TEST_CASE("weights that were never filled can be read: a program is predicted be
   REQUIRE(program.ok());
   CHECK((*program)->predictions().at(3).seconds > 0);
 }
+
+}  // namespace predict_test

@@ -6,6 +6,8 @@
 
 #include "support/stored.h"
 
+namespace recode_test {
+
 using namespace vla;
 using lower::Recode;
 
@@ -95,3 +97,5 @@ TEST_CASE("int4 codes become float32 by their step and the scale of their row") 
   CHECK(values[kWidth + 69] == 6 * 0.5f);
   CHECK(values[2] == 0);
 }
+
+}  // namespace recode_test

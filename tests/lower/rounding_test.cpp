@@ -9,6 +9,8 @@
 #include "support/graph_runner.h"
 #include "support/param_set.h"
 
+namespace rounding_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -125,3 +127,5 @@ TEST_CASE("other devices take no int8") {
   REQUIRE(!device.ok());
   CHECK(device.error().code == Code::usage);
 }
+
+}  // namespace rounding_test

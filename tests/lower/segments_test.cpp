@@ -6,6 +6,8 @@
 
 #include <string>
 
+namespace segments_test {
+
 using namespace vla::lower;
 
 namespace {
@@ -56,3 +58,5 @@ TEST_CASE("groups of a phase are from the first to the last that it reads") {
   CHECK(groups.first == 2);
   CHECK(groups.last == 4);
 }
+
+}  // namespace segments_test

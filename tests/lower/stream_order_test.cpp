@@ -10,6 +10,8 @@
 #include "lower/cpu/cpu_device.h"
 #include "lower_case.h"
 
+namespace stream_order_test {
+
 using namespace vla;
 using namespace vla::lower;
 
@@ -178,3 +180,5 @@ TEST_CASE("graphs of any order run with the least memory that is planned for one
   }
   CHECK(n_streamed > static_cast<int>(seed) / 4);  // of two budgets of each graph more than one
 }
+
+}  // namespace stream_order_test

@@ -9,6 +9,8 @@
 
 #include "support/editable_bundle.h"
 
+namespace table_rows_test {
+
 using namespace vla;
 using lower::TableRows;
 using test::EditableBundle;
@@ -84,3 +86,5 @@ TEST_CASE("a row that the file has no more is refused by name; rows that are kep
   CHECK(number_in(*table.rows, 2500) == 2500);
   CHECK(table.rows->status().ok());
 }
+
+}  // namespace table_rows_test

@@ -9,6 +9,8 @@
 #include "nn/linear.h"
 #include "support/kernel_rows.h"
 
+namespace tiles_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -122,3 +124,5 @@ TEST_CASE("amx: what products alone read stays in tiles between them, the last o
   CHECK(run("amx", 16).first.find("tiles") == std::string::npos);  // few rows are not rounded
   check_close(run("amx", 40).second, run("ggml", 40).second, 0x1p-8);
 }
+
+}  // namespace tiles_test

@@ -17,6 +17,8 @@
 #include "lower/cpu/cpu_device.h"
 #include "lower_case.h"
 
+namespace weight_stream_test {
+
 using namespace vla;
 using namespace vla::lower;
 using test::Chain;
@@ -170,3 +172,5 @@ TEST_CASE("a plan keeps what there is room for, spread evenly") {
   CHECK(device->plan_weights(*prefix, *step, 0)->streamed.size() == Chain::kLayers - 1);
   for (const auto& group : most.streamed) CHECK(group.front() != &chain.list().params().front());  // the step's
 }
+
+}  // namespace weight_stream_test

@@ -9,6 +9,8 @@
 #include "lower/cpu/cpu_device.h"
 #include "lower_case.h"
 
+namespace weight_table_test {
+
 using namespace vla;
 
 namespace {
@@ -54,3 +56,5 @@ TEST_CASE("a matrix may lie elsewhere in the next run, and the result is the sam
     CHECK(static_cast<const Device&>(device).get(*y) == expected);
   }
 }
+
+}  // namespace weight_table_test

@@ -7,6 +7,8 @@
 #include <cmath>
 #include <set>
 
+namespace patch_grid_test {
+
 using namespace vla;
 
 TEST_CASE("squares of patches follow each other row by row, and the patches of a square likewise") {
@@ -58,3 +60,5 @@ TEST_CASE("a single row of patches reads the first row of the table") {
   CHECK(blend.ids[0] == std::vector<std::int32_t>{0, 1, 2});
   CHECK(blend.weights[0] == std::vector<float>{1, 1, 1});
 }
+
+}  // namespace patch_grid_test

@@ -9,6 +9,8 @@
 
 #include "support/editable_bundle.h"
 
+namespace position_ids_test {
+
 using namespace vla;
 
 TEST_CASE("a full 32 x 32 grid reads every row of its table once, in order") {
@@ -72,3 +74,5 @@ TEST_CASE("an unknown position rule is a bad bundle") {
   REQUIRE_FALSE(ids.ok());
   CHECK(ids.error().code == Code::bad_bundle);
 }
+
+}  // namespace position_ids_test

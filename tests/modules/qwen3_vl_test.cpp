@@ -4,6 +4,8 @@
 
 #include <doctest/doctest.h>
 
+namespace qwen3_vl_test {
+
 using namespace vla;
 
 TEST_CASE("text behind a image counts on from its longer side, and the tokens of a image share a time") {
@@ -35,3 +37,5 @@ TEST_CASE("a prompt that ends with a image has no text behind it") {
   const std::vector<int> starts = {1, 2};
   CHECK(mrope_position_ids(starts, 1, 1, 3) == std::vector<PositionId>{{0, 0, 0}, {1, 1, 1}, {2, 2, 2}});
 }
+
+}  // namespace qwen3_vl_test

@@ -6,6 +6,8 @@
 
 #include <cmath>
 
+namespace timestep_embedding_test {
+
 using namespace vla;
 
 TEST_CASE("the time embedding starts at the shortest period and ends at the longest, sines before cosines") {
@@ -60,3 +62,5 @@ TEST_CASE("slow waves put cosines first, and an odd width ends in a zero") {
   CHECK(table[32] == 0);
   CHECK(table[65] == 0);
 }
+
+}  // namespace timestep_embedding_test

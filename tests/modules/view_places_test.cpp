@@ -6,6 +6,8 @@
 
 #include <tuple>
 
+namespace view_places_test {
+
 using namespace vla;
 
 namespace {
@@ -61,3 +63,5 @@ TEST_CASE("views that overlap, or stand where no text is in front of them, are r
   CHECK_FALSE(make("policy.view_starts_from_end", {7, 5}, 3, kEnd).sound);
   CHECK_FALSE(make("policy.view_starts_from_end", {9, 2}, 3, kEnd).sound);
 }
+
+}  // namespace view_places_test

@@ -14,6 +14,8 @@
 #include "support/graph_runner.h"
 #include "support/param_set.h"
 
+namespace adaptive_norm_test {
+
 using namespace vla;
 using test::ramp;
 
@@ -167,3 +169,5 @@ TEST_CASE("a GELU-gated MLP multiplies the activated gate with what goes up") {
       CHECK(at(got, token * kWidth + i) == doctest::Approx(dot(down, i, hidden, 0, kHidden)).epsilon(1e-5));
   }
 }
+
+}  // namespace adaptive_norm_test

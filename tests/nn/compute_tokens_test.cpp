@@ -15,6 +15,8 @@
 #include "support/graph_runner.h"
 #include "support/param_set.h"
 
+namespace compute_tokens_test {
+
 using namespace vla;
 using test::ramp;
 
@@ -116,3 +118,5 @@ TEST_CASE("what is tapped is computed whole, once") {
     CHECK(some.flop <= all.flop);
   }
 }
+
+}  // namespace compute_tokens_test

@@ -13,6 +13,8 @@
 #include "support/graph_runner.h"
 #include "support/param_set.h"
 
+namespace convolution_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -190,3 +192,5 @@ TEST_CASE("the places of cells are sines and cosines of row and column") {
         CHECK(std::abs(got[static_cast<std::size_t>((row * kColumns + column) * kWidth + i)] - expected) <= 5e-6);
       }
 }
+
+}  // namespace convolution_test

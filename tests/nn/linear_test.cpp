@@ -14,6 +14,8 @@
 #include "support/graph_runner.h"
 #include "support/param_set.h"
 
+namespace linear_test {
+
 using namespace vla;
 using test::ramp;
 
@@ -131,3 +133,5 @@ TEST_CASE("a norm before products gives what the norm and the products give one 
       return l.c(g, gated(g, l, h));
     });
 }
+
+}  // namespace linear_test

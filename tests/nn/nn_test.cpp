@@ -12,6 +12,8 @@
 #include "nn/tokens.h"
 #include "support/graph_runner.h"
 
+namespace nn_test {
+
 using namespace vla;
 using test::ramp;
 using test::run_graph;
@@ -198,3 +200,5 @@ TEST_CASE("a tap of a view keeps its values when later nodes reuse the memory") 
   });
   CHECK(y == std::vector<float>{2, 4, 6, 8});
 }
+
+}  // namespace nn_test

@@ -11,6 +11,8 @@
 #include "kernels/kernel_set.h"
 #include "support/graph_runner.h"
 
+namespace rope_test {
+
 using namespace vla;
 using test::ramp;
 using test::run_graph;
@@ -185,3 +187,5 @@ TEST_CASE("text among images turns as text alone") {
   const auto one = run_graph([&](Graph& g) { return rotary_table(g, 128, 5e6f, RotaryAngle::product, positions); });
   CHECK(one == run_graph([&](Graph& g) { return mrope_table(g, 128, 5e6f, {24, 20, 20}, places); }));
 }
+
+}  // namespace rope_test

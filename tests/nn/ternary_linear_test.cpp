@@ -12,6 +12,8 @@
 #include "support/graph_runner.h"
 #include "support/param_set.h"
 
+namespace ternary_linear_test {
+
 using namespace vla;
 using test::ramp;
 
@@ -144,3 +146,5 @@ TEST_CASE("a ternary product whose rows are no whole bytes is refused") {
   REQUIRE_FALSE(fits.ok());
   CHECK(fits.error().message().find("odd.weight") != std::string::npos);
 }
+
+}  // namespace ternary_linear_test

@@ -12,6 +12,8 @@
 #include "nn/tokens.h"
 #include "support/graph_runner.h"
 
+namespace tokens_test {
+
 using namespace vla;
 using test::run_graph;
 
@@ -136,3 +138,5 @@ TEST_CASE("filled tokens hold their number, and others of the same shape another
   const auto got = run_graph([](Graph& g) { return concat_tokens(g, {full(g, 0, 2, 1), full(g, 1.5f, 2, 1)}); });
   CHECK(got == Values{0, 0, 1.5f, 1.5f});
 }
+
+}  // namespace tokens_test

@@ -10,6 +10,8 @@
 
 #include "processor/support.h"
 
+namespace action_tokens_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -185,3 +187,5 @@ TEST_CASE("a token of a bin stands for its centre, the nearest one where it name
   keys.set("action_tokens.first_id", std::int64_t{3});
   CHECK(contains(refusal(ActionTokens::read(keys), Code::bad_bundle), "action_tokens.n_bin"));
 }
+
+}  // namespace action_tokens_test

@@ -14,6 +14,8 @@
 #include "processor/resample.h"
 #include "processor/sample.h"
 
+namespace bitvla_recipe_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -160,3 +162,5 @@ TEST_CASE("a weight in float64 and a statistic in bfloat16 are refused") {
     if (tensor.name == "stats.action.q01") tensor = {tensor.name, DType::bf16, {2}, std::string(4, '\0')};
   CHECK(contains(refusal(create(bundle), Code::bad_bundle), "f32 or f64"));
 }
+
+}  // namespace bitvla_recipe_test

@@ -6,6 +6,8 @@
 
 #include "processor/support.h"
 
+namespace columns_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -72,3 +74,5 @@ TEST_CASE("the sigmoid of a column's numbers is from 0 to 1, and what is no numb
   map_columns(Sigmoid{{3}}, x);
   CHECK(x[3] == static_cast<float>(0.81757447619364));  // torch rounds it to the number below
 }
+
+}  // namespace columns_test

@@ -4,6 +4,8 @@
 // Ops of a policy with places for views in its prompt: Evo-1.
 #include "processor/sample.h"
 
+namespace evo1_recipe_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -209,3 +211,5 @@ TEST_CASE("these ops in an order that has no meaning are refused") {
   recipe["state"][2] = Json::parse(R"({"op": "affine", "columns": [0], "scale": 1.0, "shift": 0.0})");
   CHECK(contains(refused(recipe), "processor.recipe.state[2].op: expected the robot's conventions before normalize"));
 }
+
+}  // namespace evo1_recipe_test

@@ -11,6 +11,8 @@
 #include "processor/resample.h"
 #include "processor/sample.h"
 
+namespace groot_recipe_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -546,3 +548,5 @@ TEST_CASE("floats come as they are where no op changes a pixel, and are refused 
   std::vector<float> square(12);
   CHECK(contains(padded->fit->apply(frame, 0, square, "view").error().message(), "expected pixels of 8 bits"));
 }
+
+}  // namespace groot_recipe_test

@@ -14,6 +14,8 @@
 #include "processor/image_codecs.h"
 #include "processor/support.h"
 
+namespace image_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -373,3 +375,5 @@ TEST_CASE("a frame whose pixels do not fit its size is refused") {
   refusal(check_frame({0, 0, std::vector<std::uint8_t>()}, "f"), Code::bad_observation);
   refusal(check_frame({-1, -2, std::vector<float>(6)}, "f"), Code::bad_observation);
 }
+
+}  // namespace image_test

@@ -3,6 +3,8 @@
 #include "processor/processor.h"
 #include "processor/sample.h"
 
+namespace instruction_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -225,3 +227,5 @@ TEST_CASE("a recipe without a text and a vocabulary, or a text without one, are 
   bundle.set("observation.max_text_tokens", std::int64_t{8});
   CHECK(contains(refusal(create(bundle), Code::bad_bundle), "observation.max_text_tokens"));
 }
+
+}  // namespace instruction_test

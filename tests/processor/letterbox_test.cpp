@@ -8,6 +8,8 @@
 #include "base/npy.h"
 #include "processor/images.h"
 
+namespace letterbox_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -131,3 +133,5 @@ TEST_CASE("affine rounds the product before it adds") {
   CHECK(values[0] == product - 0.3f);
   CHECK(values[0] != std::fma(0.1f, 3.0f, -0.3f));
 }
+
+}  // namespace letterbox_test

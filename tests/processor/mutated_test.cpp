@@ -9,6 +9,8 @@
 #include "fuzz/recipe_target.h"
 #include "processor/sample.h"
 
+namespace mutated_test {
+
 using namespace vla;
 using namespace vla::test;
 using fuzz::Random;
@@ -78,3 +80,5 @@ TEST_CASE("damaged images are refused, or decode in bounded time and memory") {
   }
   CHECK(n_file > 60);
 }
+
+}  // namespace mutated_test

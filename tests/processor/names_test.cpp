@@ -4,6 +4,8 @@
 
 #include <doctest/doctest.h>
 
+namespace names_test {
+
 using namespace vla;
 
 namespace {
@@ -53,3 +55,5 @@ TEST_CASE("a message lists 50 names at most") {
   CHECK(listed(50).find("more") == std::string::npos);
   CHECK(listed(53) == listed(50) + " and 3 more");
 }
+
+}  // namespace names_test

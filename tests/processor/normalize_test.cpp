@@ -4,6 +4,8 @@
 
 #include "processor/support.h"
 
+namespace normalize_test {
+
 using namespace vla;
 using namespace vla::test;
 using Direction = Normalizer::Direction;
@@ -67,3 +69,5 @@ TEST_CASE("evo1's kinds add eps in both directions") {
   CHECK(mapped(norm_rule("evo1_min_max"), Direction::normalize, 0.5, 3.0f, 3.0f, 3.25f) == 0.0f);
   CHECK(mapped(norm_rule("evo1_quantiles"), Direction::unnormalize, 0.5, 3.0f, 3.0f, 0.0f) == 3.25f);
 }
+
+}  // namespace normalize_test

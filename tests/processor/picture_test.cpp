@@ -4,6 +4,8 @@
 
 #include "processor/sample.h"
 
+namespace picture_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -55,3 +57,5 @@ TEST_CASE("no picture is made of a frame that an observation could not have") {
   frame.width = 3;
   CHECK(contains(refusal(picture_of(make(), frame, 1), Code::bad_observation), "observation.images.wrist"));
 }
+
+}  // namespace picture_test

@@ -9,6 +9,8 @@
 
 #include "processor/sample.h"
 
+namespace pose_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -95,3 +97,5 @@ TEST_CASE("a pose must lie within the action and within the state") {
                  "processor.recipe.action[0].state_column: expected 9 columns of 10"));
   CHECK(contains(refused("/action/0/format", "quaternion"), "processor.recipe.action[0].format"));
 }
+
+}  // namespace pose_test

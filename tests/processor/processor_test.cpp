@@ -9,6 +9,8 @@
 #include "processor/constant_actions.h"
 #include "processor/sample.h"
 
+namespace processor_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -379,3 +381,5 @@ TEST_CASE("an op of one view leaves the pixels of the others alone") {
   bundle.set("processor.recipe", recipe.dump());
   CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.image: expected ops of the 3 views"));
 }
+
+}  // namespace processor_test

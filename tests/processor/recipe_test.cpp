@@ -5,6 +5,8 @@
 #include "processor/ops/columns.h"
 #include "processor/support.h"
 
+namespace recipe_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -287,3 +289,5 @@ TEST_CASE("a robot's conventions come before the normalization, and nothing afte
     CHECK(contains(refused(recipe), "nothing after pad, bins or drop"));
   }
 }
+
+}  // namespace recipe_test

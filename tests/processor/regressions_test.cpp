@@ -8,6 +8,8 @@
 #include "fuzz/tokenizer_target.h"
 #include "processor/support.h"
 
+namespace regressions_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -34,3 +36,5 @@ TEST_CASE("images from fuzzing decode to sound frames or are refused") {
 TEST_CASE("texts and JSON from fuzzing are encoded or refused") {
   CHECK(replay("tests/fuzz/regressions/tokenizer", [](const std::string& bytes) { fuzz::check_tokenizer(bytes); }) > 0);
 }
+
+}  // namespace regressions_test

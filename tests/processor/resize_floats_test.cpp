@@ -7,6 +7,8 @@
 #include "processor/images.h"
 #include "processor/recipe.h"
 
+namespace resize_floats_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -127,3 +129,5 @@ TEST_CASE("what the document does not say of resize_floats is refused") {
   late.update({{"from_width", 4}, {"from_height", 4}});
   CHECK(contains(refused(Json::array({size, late})), "image[1].from_"));
 }
+
+}  // namespace resize_floats_test

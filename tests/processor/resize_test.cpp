@@ -7,6 +7,8 @@
 #include "processor/ops/planes.h"
 #include "processor/resample.h"
 
+namespace resize_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -136,3 +138,5 @@ TEST_CASE("standardize equals torch on every byte in each arithmetic") {
     rest = rest.subspan(pixels.size());
   }
 }
+
+}  // namespace resize_test

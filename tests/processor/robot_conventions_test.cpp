@@ -4,6 +4,8 @@
 // A state in the prompt, relative actions, and numbers that are flipped or stretched between robot and network.
 #include "processor/sample.h"
 
+namespace robot_conventions_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -70,3 +72,5 @@ TEST_CASE("a state that the network does not see leaves nothing for policy.d_sta
   bundle.set("policy.d_state", std::int64_t{2});
   CHECK(contains(refusal(create(bundle), Code::bad_bundle), "policy.d_state"));
 }
+
+}  // namespace robot_conventions_test

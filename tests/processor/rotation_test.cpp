@@ -6,6 +6,8 @@
 
 #include "processor/sample.h"
 
+namespace rotation_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -168,3 +170,5 @@ TEST_CASE("a rotation stands for a whole feature, and behind what normalizes") {
   CHECK(contains(refused({turn("quaternion", 1)}, {turn_action("euler_angles_rpy", 2)}),
                  "processor.recipe.action[0].column: expected 3 columns of 4 from here on, found 2"));
 }
+
+}  // namespace rotation_test

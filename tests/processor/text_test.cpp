@@ -6,6 +6,8 @@
 #include "processor/recipe.h"
 #include "processor/support.h"
 
+namespace text_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -66,3 +68,5 @@ TEST_CASE("an instruction with a text that the recipe refuses is refused, and op
   CHECK(contains(refusal(parsed(R"({"op": "strip"},)" + ops), Code::bad_bundle), "text[1].op"));
   CHECK(contains(refusal(parsed(R"({"op": "refuse", "text": ""},)"), Code::bad_bundle), "text[0].text"));
 }
+
+}  // namespace text_test

@@ -10,6 +10,8 @@
 #include "processor/support.h"
 #include "processor/unicode.h"
 
+namespace tokenizer_test {
+
 using namespace vla;
 using namespace vla::test;
 using Json = nlohmann::json;
@@ -355,3 +357,5 @@ TEST_CASE("the keys of a WordPiece tokenizer are checked") {
   CHECK(contains(refused_keys(keys), "every token once"));
   CHECK(contains(refused_added("bert", "single_word", true), "single_word"));
 }
+
+}  // namespace tokenizer_test

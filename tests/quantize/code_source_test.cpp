@@ -8,6 +8,8 @@
 #include "quantize/quantize.h"
 #include "support/editable_bundle.h"
 
+namespace code_source_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -62,3 +64,5 @@ TEST_CASE("codes of bundles that have them are copied, each of the kind that is 
   CHECK(n_int8 > 10);
   CHECK(n_int4 > 10);
 }
+
+}  // namespace code_source_test

@@ -15,6 +15,8 @@
 #include "quantize/hessians.h"
 #include "support/golden_case.h"
 
+namespace hessian_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -166,3 +168,5 @@ TEST_CASE("most float matrices of golden cases have Hessians") {
   CAPTURE(n_asked);
   CHECK(n_known > 0.6 * n_asked);
 }
+
+}  // namespace hessian_test

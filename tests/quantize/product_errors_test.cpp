@@ -10,6 +10,8 @@
 #include "support/editable_bundle.h"
 #include "support/stored.h"
 
+namespace product_errors_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -68,3 +70,5 @@ TEST_CASE("dividing channels is kept where they were too large, and left where t
     CHECK(paths(*helpful) == std::vector<std::string>{"lm.blk.1.ffn_norm"});
   }
 }
+
+}  // namespace product_errors_test

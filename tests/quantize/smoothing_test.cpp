@@ -13,6 +13,8 @@
 #include "support/golden_case.h"
 #include "support/param_set.h"
 
+namespace smoothing_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -171,3 +173,5 @@ TEST_CASE("X-VLA's keys of zeros leave the norms of its windows to be smoothed")
           return place.path.starts_with("vision.") && place.path.ends_with("spatial.attn_norm");
         }) > 0);
 }
+
+}  // namespace smoothing_test

@@ -8,6 +8,8 @@
 #include "serve/support.h"
 #include "zmtp/curve.h"
 
+namespace access_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -79,3 +81,5 @@ TEST_CASE("with keys, a listed client is served and every other one is not") {
   const std::string friends_key = *zmtp::public_key_of(*zmtp::read_secret_key(prefix + ".friend.secret"));
   CHECK(names.peers == std::set<std::string>{friends_key});
 }
+
+}  // namespace access_test

@@ -16,6 +16,8 @@
 #include "serve/msgpack/writer.h"
 #include "support/pickled.h"
 
+namespace array_test {
+
 using namespace vla;
 using namespace vla::serve;
 
@@ -235,3 +237,5 @@ TEST_CASE("a frame in half precision has the bytes of its own arithmetic") {
   }
   CHECK(!from_lerobot({"f2", "<", {100, 41, 3}, std::string(2 * 100 * 41 * 3, '\xFF')}));
 }
+
+}  // namespace array_test

@@ -10,6 +10,8 @@
 #include "support/editable_bundle.h"
 #include "wire/envelope.h"
 
+namespace codec_test {
+
 using namespace vla;
 using namespace vla::serve;
 using namespace vla::wire;
@@ -406,3 +408,5 @@ TEST_CASE("the exchange in docs/protocol.md is what the schema makes of it, byte
   *response.mutable_error() = encode_error({Code::bad_observation, "observation.state", "6 numbers", "2"});
   check(response);
 }
+
+}  // namespace codec_test

@@ -8,6 +8,8 @@
 #include <thread>
 #include <vector>
 
+namespace double_buffer_test {
+
 using vla::serve::DoubleBuffer;
 
 TEST_CASE("acts are computed in the order in which they were prepared, and at most two are under way") {
@@ -46,3 +48,5 @@ TEST_CASE("an act that is prepared before the end is still computed") {
   acts.computed();
   CHECK(acts.to_compute() == nullptr);
 }
+
+}  // namespace double_buffer_test

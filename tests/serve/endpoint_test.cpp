@@ -11,6 +11,8 @@
 #include "support/editable_bundle.h"
 #include "zmtp/curve.h"
 
+namespace endpoint_test {
+
 using namespace vla;
 using namespace vla::net;
 using namespace vla::zmtp;
@@ -99,3 +101,5 @@ TEST_CASE("a file of client keys may have remarks, and anything else in it is re
   CHECK_FALSE(read_public_keys(test::write_file("clients", "# none\n")).ok());
   CHECK_FALSE(read_public_keys(test::scratch_path("absent")).ok());
 }
+
+}  // namespace endpoint_test

@@ -9,6 +9,8 @@
 #include "serve/support.h"
 #include "zmtp/hub.h"
 
+namespace eviction_test {
+
 using namespace vla;
 using namespace vla::net;
 using vla::zmtp::Hub;
@@ -154,3 +156,5 @@ TEST_CASE("a peer that reads no answers is not read from once they take 128 KiB,
   CHECK(handler.n_received > 0);
   CHECK(handler.n_received < 20);  // what the system's own buffers take, and one more
 }
+
+}  // namespace eviction_test

@@ -9,6 +9,8 @@
 #include "serve/support.h"
 #include "support/editable_bundle.h"
 
+namespace lerobot_test {
+
 using namespace vla;
 using namespace vla::serve;
 
@@ -130,3 +132,5 @@ TEST_CASE("what is computed follows the reference's rules") {
   first.must_go = true;
   CHECK(filter.takes(first));
 }
+
+}  // namespace lerobot_test

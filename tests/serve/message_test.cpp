@@ -13,6 +13,8 @@
 #include "serve/msgpack/writer.h"
 #include "support/editable_bundle.h"
 
+namespace message_test {
+
 using namespace vla;
 using msgpack::Framing;
 using msgpack::Value;
@@ -252,3 +254,5 @@ TEST_CASE("an array is written as the clients' packages write it") {
                                   37)));
   CHECK(npy.ends_with("\n" + data));
 }
+
+}  // namespace message_test

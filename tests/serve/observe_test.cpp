@@ -24,6 +24,8 @@
 #include "serve/support.h"
 #include "support/connect_http.h"
 
+namespace observe_test {
+
 using namespace vla;
 using namespace vla::test;
 using namespace vla::observe;
@@ -512,3 +514,5 @@ TEST_CASE("answers are compared by content: times, bundle and runtime may differ
   other.mutable_error()->set_code(v1::Error::BAD_ACTION);
   CHECK(fields_of(compare_answers(error, other)) == "code ");
 }
+
+}  // namespace observe_test

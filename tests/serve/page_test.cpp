@@ -15,6 +15,8 @@
 #include "serve/support.h"
 #include "support/connect_http.h"
 
+namespace page_test {
+
 using namespace vla;
 using namespace vla::test;
 using namespace vla::observe;
@@ -191,3 +193,5 @@ TEST_CASE("texts, names and states are told up to a size, and pixels where they 
   CHECK(watched.get("/image?act=1&view=1", seconds) == "pixels of other sides\n");
   CHECK(watched.get("/image?act=1&view=40", seconds) == "gone, or never there\n");
 }
+
+}  // namespace page_test

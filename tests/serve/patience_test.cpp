@@ -14,6 +14,8 @@
 
 #include "zmtp/hub.h"
 
+namespace patience_test {
+
 using namespace vla;
 using boost::asio::ip::tcp;
 
@@ -100,3 +102,5 @@ TEST_CASE("a machine that stood still drops nobody") {
   peers.turn();
   CHECK(peers.dropped_peers.empty());
 }
+
+}  // namespace patience_test

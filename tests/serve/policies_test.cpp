@@ -9,6 +9,8 @@
 #include "serve/support.h"
 #include "wire/interface.h"
 
+namespace policies_test {
+
 using namespace vla;
 using namespace vla::test;
 using serve::Policies;
@@ -149,3 +151,5 @@ TEST_CASE("a server that drains answers the acts in line and takes no more") {
   CHECK(running.join().ok());
   CHECK(running.server->load("after", another_engine()).error().code == Code::shutting_down);
 }
+
+}  // namespace policies_test

@@ -10,6 +10,8 @@
 
 #include "net/eviction.h"
 
+namespace queue_test {
+
 using namespace vla::serve;
 using vla::Clock;
 
@@ -274,3 +276,5 @@ TEST_CASE("over random traffic every act comes out once, bounds hold, and nobody
     CHECK(bytes == 0);
   }
 }
+
+}  // namespace queue_test

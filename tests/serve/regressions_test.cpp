@@ -12,6 +12,8 @@
 #include "fuzz/session_target.h"
 #include "support/editable_bundle.h"
 
+namespace regressions_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -93,3 +95,5 @@ TEST_CASE("damaged recordings, taps and key files are read or refused, in bounde
     for (int round = 0; round < 300; ++round) (void)fuzz::check_file(kind, fuzz::damaged(bytes, random), folder);
   }
 }
+
+}  // namespace regressions_test

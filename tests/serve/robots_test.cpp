@@ -12,6 +12,8 @@
 #include "support/editable_bundle.h"
 #include "support/pickled.h"
 
+namespace robots_test {
+
 using namespace vla;
 using namespace vla::serve;
 using namespace vla::serve::lerobot;
@@ -82,8 +84,8 @@ class Door : Calls, Robots::Server {
   void refuse(std::uint64_t, const Error& error) noexcept override {
     words = fmt::format("{}: {}", code_name(error.code), error.message());
   }
-  void opened(const Peer&) override {}
-  void closed(const Peer&, const std::string&, const std::string&) override {}
+  void opened(const serve::lerobot::Peer&) override {}
+  void closed(const serve::lerobot::Peer&, const std::string&, const std::string&) override {}
   bool ask(std::uint64_t, const std::string& request) override { return asked = request, true; }
   void refused(std::uint64_t) override {}
   void keep(const std::string& address, const std::string& bytes) override {
@@ -94,7 +96,7 @@ class Door : Calls, Robots::Server {
     }
   }
 
-  std::map<std::uint64_t, Peer> peers_;
+  std::map<std::uint64_t, serve::lerobot::Peer> peers_;
   std::uint64_t n_connection_ = 0, n_call_ = 0;
 };
 
@@ -211,3 +213,5 @@ TEST_CASE("an answer reaches the call that waits for it, and a refusal is a refu
   door.robots.answered(robot, std::as_bytes(std::span(busy)));
   CHECK(door.words.starts_with("busy"));
 }
+
+}  // namespace robots_test

@@ -10,6 +10,8 @@
 #include "serve/support.h"
 #include "serve/warm_up.h"
 
+namespace seen_sizes_test {
+
 using namespace vla;
 using namespace vla::test;
 using serve::SeenSizes;
@@ -139,3 +141,5 @@ TEST_CASE("the newest sizes are kept") {
   CHECK(kept.front().inputs.n_text == 2);
   CHECK(kept.back() == *engine->last_shape());
 }
+
+}  // namespace seen_sizes_test

@@ -11,6 +11,8 @@
 #include "serve/support.h"
 #include "serve/warm_up.h"
 
+namespace server_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -207,3 +209,5 @@ TEST_CASE("the warm-up shortens a text that would cut the prompt's own tokens") 
   REQUIRE(serve::warm_up(*engine).ok());
   CHECK(engine->memory().plan > before);
 }
+
+}  // namespace server_test

@@ -10,6 +10,8 @@
 #include <cstring>
 #include <random>
 
+namespace session_test {
+
 using namespace vla;
 using namespace vla::zmtp;
 
@@ -222,3 +224,5 @@ TEST_CASE("no bytes of a peer do more than end its connection") {
     CHECK(session.n_held() <= 2 * kMaxMessage);
   }
 }
+
+}  // namespace session_test

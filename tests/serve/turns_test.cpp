@@ -6,6 +6,8 @@
 
 #include "serve/support.h"
 
+namespace turns_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -299,3 +301,5 @@ TEST_CASE("a server that begins to take acts never looks as if it drained") {
     REQUIRE(health.uptime_s < 60);
   }
 }
+
+}  // namespace turns_test

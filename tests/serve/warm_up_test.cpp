@@ -8,6 +8,8 @@
 #include "serve/support.h"
 #include "support/joint_bundle.h"
 
+namespace warm_up_test {
+
 using namespace vla;
 using namespace vla::test;
 
@@ -74,3 +76,5 @@ TEST_CASE("one robot of several that is not finite is refused by its tag") {
   REQUIRE_FALSE(warm.ok());
   CHECK(contains(warm.error().where, "joint.gguf of dog: warm-up"));
 }
+
+}  // namespace warm_up_test
