@@ -162,9 +162,13 @@ soak: build
 test-vulkan: vulkan
 	VLA_ALL_CASES=1 ctest --preset cpu -L '^vulkan$$' --output-on-failure
 
-# All mistakes that are made in kernels for CUDA, all families of policies and all architectures; `make test` tries some.
+# All mistakes that are made in kernels for CUDA, all families of policies and all architectures, of which `make test` tries some; and
+# the kernels' tests under the sanitizers.
 test-cuda: build
 	@scripts/cuda.sh .cache/nvcc nvcc
+	@test -f build/asan/build.ninja || cmake --preset asan $(CMAKE_ARGS)
+	cmake --build --preset asan --target test_cuda
+	build/asan/bin/test_cuda
 	VLA_ALL_MISTAKES=1 VLA_ALL_FAMILIES=1 VLA_ALL_ARCHITECTURES=1 VLA_ALL_FAULTS=1 VLA_ALL_CASES=1 ctest --preset cpu -R '^cuda_' --output-on-failure
 
 # The least memory of all published policies in all dtypes and kernels, of which `make test` tries some: half an hour, 8 GB of memory.

@@ -87,6 +87,13 @@ if(VLA_CUDA_GGML)
   set(GGML_CUDA_NO_VMM ON CACHE BOOL "" FORCE)  # it would need the driver at link time
 endif()
 add_subdirectory(${vla_ggml_tree} ${CMAKE_BINARY_DIR}/ggml EXCLUDE_FROM_ALL)
+# Training, a reader of GGUF, and formats that no bundle uses: nothing calls them.
+foreach(target ggml-base ggml-cpu)
+  get_target_property(sources ${target} SOURCES)
+  list(FILTER sources EXCLUDE REGEX "(^|/)(ggml-opt|gguf|repack)[.]cpp$")
+  set_property(TARGET ${target} PROPERTY SOURCES ${sources})
+endforeach()
+target_compile_options(ggml-base PRIVATE -O1)  # it makes graphs, once
 # Where a driver fails, ggml's abort is an exception that leaves its functions (src/ggml/guard.h).
 target_compile_options(ggml-base PRIVATE $<$<COMPILE_LANGUAGE:C>:-fexceptions>)
 foreach(target ggml ggml-base ggml-cpu)  # its headers are not ours to warn about

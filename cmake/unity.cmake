@@ -9,11 +9,9 @@ if(CMAKE_CXX_COMPILER_LAUNCHER)
 endif()
 option(VLA_UNITY "Compile sources in groups, and after precompiled headers" ${vla_unity})
 
-# Groups of eight sources, or of `size`. CMake leaves sources with options of their own out of every group.
+# CMake leaves sources with options of their own out of every group.
 function(vla_group target)
-  set(size 8 ${ARGN})
-  list(GET size -1 size)
-  set_target_properties(${target} PROPERTIES UNITY_BUILD ${VLA_UNITY} UNITY_BUILD_BATCH_SIZE ${size})
+  set_target_properties(${target} PROPERTIES UNITY_BUILD ${VLA_UNITY} UNITY_BUILD_BATCH_SIZE 16)
 endfunction()
 
 # For code that runs once, at load or in a test: compiling it takes longer than running it.
@@ -21,6 +19,13 @@ function(vla_optimize_little target)
   if(VLA_SANITIZE)
     target_compile_options(${target} PRIVATE -O0)
   else()
+    target_compile_options(${target} PRIVATE -O1)
+  endif()
+endfunction()
+
+# For code that plans what kernels compute, or shows it: a quarter less to compile. Sanitized code has as little anyway.
+function(vla_optimize_less target)
+  if(NOT VLA_SANITIZE)
     target_compile_options(${target} PRIVATE -O1)
   endif()
 endfunction()
