@@ -6,7 +6,6 @@
 #include <cstring>
 
 #include "lower/cuda/emit.h"
-#include "lower/cuda/merge_calls.h"
 
 namespace vla::lower {
 Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_ptr<CudaQueue> queue,
