@@ -165,7 +165,7 @@ class Costs {
       const MatrixKind kind = l.matrix(*node).kind;
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
       const auto [shape, n_split, tile, us] = op.cut;
-      const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
+      const std::int64_t size = shape == cuda::Bf16Shape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
       if (kind == MatrixKind::f32) {  // padded rows and columns are multiplied, too
         const double padded = tiles * static_cast<double>(size * size) * 2 * static_cast<double>(weight.shape[0]);
@@ -177,7 +177,7 @@ class Costs {
         const std::int64_t n_block = (columns + width - 1) / width * ((rows + 63) / 64) * n_split;
         const std::int64_t bytes = (std::min<std::int64_t>(rows, 64) + width) * weight.shape[0] * 2 / n_split;
         add_blocks(cost, static_cast<double>(n_block), static_cast<double>(bytes) / (kSmBytes * gpu.clock));
-      } else if (shape == ProductShape::few) {
+      } else if (shape == cuda::Bf16Shape::few) {
         add_blocks(cost, gpu.n_sm, flop_of(*node) / (is_of_codes(kind) ? gpu.dot4 : gpu.f32));
       } else {
         const Loop& loop = loop_of(kernel_name(kind) + (size == 128 ? "_128" : "_64"));

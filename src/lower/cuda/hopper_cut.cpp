@@ -85,7 +85,7 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
   const bool is_bf16 = kind == MatrixKind::bf16;
   const std::int64_t n_step = ceil_of(depth, is_bf16 ? cuda::kHopperDepth : cuda::kHopperInt8Depth);
   const Rates& rates = is_bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
-  ProductCut best = {ProductShape::hopper, 1, 0, std::numeric_limits<double>::max()};
+  ProductCut best = {.shape = cuda::Bf16Shape::rows128, .us = std::numeric_limits<double>::max()};
   for (const Candidate& tile : candidates(kind, what))
     for (const int n_split : {1, 2, 3, 4, 6, 8}) {
       // The measured range: a share has at least 4 steps, or for codes 1 step with up to 4 shares. Products of codes

@@ -77,7 +77,7 @@ class CudaLayouts final : Layouts {
     const ProductCut cut = cut_product(l, kind, n_row, is_one ? 2 * y[0] : y[0], depth, is_one);
     if (is_of_codes(kind))
       round(step, op, DType::i8, kernels::quantized_stride(depth), "round");
-    else if (kind == MatrixKind::bf16 && cut.shape != ProductShape::few)
+    else if (kind == MatrixKind::bf16 && cut.shape != cuda::Bf16Shape::few)
       round(step, op, DType::bf16, bf16_stride(depth), "round");
     else if (op.norm != nullptr)
       round(step, op, DType::f32, depth, "round");
@@ -94,7 +94,7 @@ class CudaLayouts final : Layouts {
   bool is_plain_product(const CudaOp& op) const {
     const auto* product = std::get_if<LinearOp>(&op.op);
     return product != nullptr && product->linears.size() == 1 && op.reads.size() == 1 &&
-           l.matrix(*product->linears[0]).kind == MatrixKind::bf16 && op.cut.shape != ProductShape::few;
+           l.matrix(*product->linears[0]).kind == MatrixKind::bf16 && op.cut.shape != cuda::Bf16Shape::few;
   }
   /// Gives the plain products of one x, such as q, k and v, the same cut, so that merge_calls makes one launch of them.
   /// Does nothing if separate launches are faster, or if `first` is not the first product of its x.
@@ -111,9 +111,8 @@ class CudaLayouts final : Layouts {
     const Shape& y = product.linears[0]->shape;
     const std::int64_t n_row = count(y) / y[0], depth = l.value(product.x).shape[0];
     ProductCut cut = cut_product(l, MatrixKind::bf16, n_row, n_column, depth, false);
-    if (cut.shape == ProductShape::hopper)
-      cut = cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::several, l.n_sm);
-    const bool is_one_launch = cut.shape == ProductShape::hopper || (strip_width(cut.shape) > 0 && cut.n_split == 1);
+    if (cut.tile) cut = cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::several, l.n_sm);
+    const bool is_one_launch = cut.tile || (strip_width(cut.shape) > 0 && cut.n_split == 1);
     if (!is_one_launch || cut.us >= apart) return;
     for (const std::size_t i : all) {
       l.ops[i].cut = cut;
@@ -240,13 +239,13 @@ double strip_us(std::int64_t width, int n_split, std::int64_t n_row, std::int64_
 
 /// The strip width and number of shares with the shortest time.
 ProductCut cut_in_strips(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
-  ProductCut best = {ProductShape::strip16, 1, 0, std::numeric_limits<double>::max()};
-  for (const ProductShape shape :
-       {ProductShape::strip16, ProductShape::strip32, ProductShape::strip64, ProductShape::strip128})
+  using enum cuda::Bf16Shape;
+  ProductCut best = {.us = std::numeric_limits<double>::max()};
+  for (const cuda::Bf16Shape shape : {strip16, strip32, strip64, strip128})
     for (const int n_split : {1, 2, 4, 8}) {
       if (n_split > 1 && depth / n_split < 8 * cuda::kBf16Depth) break;
       const double us = strip_us(strip_width(shape), n_split, n_row, n_column, depth, n_sm);
-      if (us < best.us) best = {shape, n_split, 0, us};
+      if (us < best.us) best = {.shape = shape, .n_split = n_split, .us = us};
     }
   return best;
 }
@@ -276,11 +275,10 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
   }
   if (has_tiles) return cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
   const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
-  const ProductShape shape = is_few                          ? ProductShape::few
-                             : n_row > 64 && n_large >= n_sm ? ProductShape::rows128
-                                                             : ProductShape::rows64;
+  using enum cuda::Bf16Shape;
+  const cuda::Bf16Shape shape = is_few ? few : n_row > 64 && n_large >= n_sm ? rows128 : rows64;
   if (kind == MatrixKind::f32) return {shape, 1};
-  std::int64_t n_block = shape == ProductShape::rows128 ? n_large : blocks_of(n_row, n_column, 64, 64);
+  std::int64_t n_block = shape == rows128 ? n_large : blocks_of(n_row, n_column, 64, 64);
   if (is_few) n_block = blocks_of(1, n_column, 1, is_bf16 ? 8 : 128);
   // A share has at least `least` steps. The depth is split only if there are fewer blocks than SMs. Codes allow fewer
   // steps per share: their steps are twice as deep, and one kernel that adds many shares is faster than the epilogues
