@@ -7,12 +7,15 @@
 
 #include "cuda/kernels/attention.h"
 #include "cuda/kernels/linear_bf16.h"
+#include "kernels/sizes.h"
 #include "lower/cuda/cuda_queue.h"
 #include "lower/cuda/cuda_weights.h"
 #include "lower/ops.h"
 
 /// A GPU's passes: copy operands that kernels need contiguous, and make the launches of each operation.
 namespace vla::lower {
+
+using kernels::ceil_div;
 
 /// Norms and rotates rows of heads for attention, and converts them to bf16 if attention reads that.
 struct HeadOp {

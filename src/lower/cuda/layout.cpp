@@ -220,7 +220,7 @@ class CudaLayouts final : Layouts {
 };
 
 std::int64_t blocks_of(std::int64_t n_row, std::int64_t n_column, std::int64_t rows, std::int64_t columns) {
-  return (n_row + rows - 1) / rows * ((n_column + columns - 1) / columns);
+  return ceil_div(n_row, rows) * ceil_div(n_column, columns);
 }
 
 /// Estimated microseconds of a strip kernel, from measurements on an H200: a warp takes a fixed time per step of the
@@ -230,10 +230,9 @@ double strip_us(std::int64_t width, int n_split, std::int64_t n_row, std::int64_
   constexpr double kBegin = 2, kOfAll = 2.5e6, kFinish = 2;
   const std::int64_t n_block = blocks_of(n_row, n_column, 64, width) * n_split;
   const std::int64_t n_warp = width <= 32 ? 8 : 256 / width;  // warps that share the depth
-  const std::int64_t of_warp =
-      (depth + cuda::kBf16Depth * n_warp * n_split - 1) / (cuda::kBf16Depth * n_warp * n_split);
+  const std::int64_t of_warp = ceil_div(depth, cuda::kBf16Depth * n_warp * n_split);
   const double of_step = width == 16 ? 0.85 : 1.4;
-  const double us = kBegin + static_cast<double>((n_block + n_sm - 1) / n_sm * of_warp) * of_step;
+  const double us = kBegin + static_cast<double>(ceil_div(n_block, n_sm) * of_warp) * of_step;
   return n_split == 1 ? us : us + kFinish + static_cast<double>(2 * 4 * n_row * n_column * n_split) / kOfAll;
 }
 
@@ -284,7 +283,7 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
   // steps per share: their steps are twice as deep, and one kernel that adds many shares is faster than the epilogues
   // of a few blocks.
   const std::int64_t step = is_bf16 ? cuda::kBf16Depth : cuda::Int8Tile::kDepth, least = is_bf16 ? 8 : 3;
-  const std::int64_t most = std::max<std::int64_t>((depth + step - 1) / step / least, 1);
+  const std::int64_t most = std::max<std::int64_t>(ceil_div(depth, step) / least, 1);
   return {shape, static_cast<int>(std::clamp<std::int64_t>(n_sm / std::max<std::int64_t>(n_block, 1), 1, most))};
 }
 
