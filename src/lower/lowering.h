@@ -121,6 +121,31 @@ void arrange(Lowering& l, std::vector<TargetOp>& ops) {
   });
 }
 
+/// The address of each base, from those of the arena and of the program's own memory. of_param: the address of a
+/// parameter.
+template <class Address, class OfParam>
+std::vector<Address> addresses_of(const Lowering& l, Address arena, Address own, OfParam of_param) {
+  const auto address = [&](const Value& value) -> Address {
+    switch (value.placement) {
+      case Value::Placement::arena:
+        return arena + value.begin;
+      case Value::Placement::kept:
+      case Value::Placement::constant:
+        return own + value.begin;
+      case Value::Placement::slot:
+        return reinterpret_cast<Address>(value.slot->place);
+      case Value::Placement::parameter:
+        return of_param(*value.node->as<op::Parameter>()->param);
+      case Value::Placement::thread:
+        break;  // scratch memory of each worker
+    }
+    return {};
+  };
+  std::vector<Address> all;
+  for (const Value& value : l.values) all.push_back(&l.value(value.base) == &value ? address(value) : Address{});
+  return all;
+}
+
 /// Prints an operation's line of Program::text: `what first operand -> results`.
 std::string line_of(const Lowering& l, const Step& step, const std::string& kernel, const std::string& what,
                     const Work& work);

@@ -32,27 +32,10 @@ Result<std::unique_ptr<Program>> CpuProgram::make(CpuLowering& l, const Memory& 
 
 Status CpuProgram::give_addresses(CpuLowering& l) {
   VLA_TRY(own_, Memory::allocate(l.kept_size, "constants"));
-  const auto address = [&](const Value& value) -> std::byte* {
-    switch (value.placement) {
-      case Value::Placement::arena:
-        return arena_.data() + value.begin;
-      case Value::Placement::kept:
-      case Value::Placement::constant:
-        return own_.data() + value.begin;
-      case Value::Placement::slot:
-        return static_cast<std::byte*>(value.slot->place);
-      case Value::Placement::parameter:
-        return const_cast<std::byte*>(l.weights.data(value.node->as<op::Parameter>()->param));
-      case Value::Placement::thread:
-        break;
-    }
-    return nullptr;  // thread: scratch memory of each worker
-  };
-  for (std::size_t i = 0; i < l.values.size(); ++i) {
-    const Value& value = l.values[i];
-    l.data.push_back(value.base == static_cast<ValueId>(i) ? address(value) : nullptr);
-    if (value.placement == Value::Placement::constant) std::memcpy(l.data[i], constant_of(value), value.size);
-  }
+  l.data = addresses_of(l, arena_.data(), own_.data(), [&](const Param& param) { return l.weights.data(&param); });
+  for (std::size_t i = 0; i < l.values.size(); ++i)
+    if (l.values[i].placement == Value::Placement::constant)
+      std::memcpy(l.data[i], constant_of(l.values[i]), l.values[i].size);
   return {};
 }
 

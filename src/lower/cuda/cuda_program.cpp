@@ -32,24 +32,7 @@ Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
     std::memcpy(&constants[value.begin - first], constant_of(value), value.size);
   }
   if (!constants.empty()) VLA_CHECK(queue_->upload(own_->address() + first, constants.data(), constants.size()));
-  const auto address = [&](const Value& value) -> cuda::Address {
-    switch (value.placement) {
-      case Value::Placement::arena:
-        return arena.address() + value.begin;
-      case Value::Placement::kept:
-      case Value::Placement::constant:
-        return own_->address() + value.begin;
-      case Value::Placement::slot:
-        return reinterpret_cast<cuda::Address>(value.slot->place);
-      case Value::Placement::parameter:
-        return l.weights[*value.node->as<op::Parameter>()->param].data;
-      case Value::Placement::thread:
-        break;
-    }
-    return 0;
-  };
-  for (std::size_t i = 0; i < l.values.size(); ++i)
-    l.data.push_back(l.values[i].base == static_cast<ValueId>(i) ? address(l.values[i]) : 0);
+  l.data = addresses_of(l, arena.address(), own_->address(), [&](const Param& param) { return l.weights[param].data; });
   return {};
 }
 
