@@ -51,10 +51,10 @@ using Operands = std::vector<Operand>;
 
 /// The part of an operation that the passes after fusion use.
 struct Step {
-  std::vector<ValueId> reads, writes;  // reads: the operands without kNone, in order
-  std::vector<const Param*> matrices;  // matrices that it multiplies by
-  int order = 0;                       // the id of the node whose result it computes
-  bool invariant = false;              // its result is the same in every run
+  std::vector<ValueId> reads = {}, writes = {};  // reads: the operands without kNone, in order
+  std::vector<const Param*> matrices = {};       // matrices that it multiplies by
+  int order = 0;                                 // the id of the node whose result it computes
+  bool invariant = false;                        // its result is the same in every run
   int phase = 0;
 };
 struct Lowering {

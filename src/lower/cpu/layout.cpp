@@ -11,9 +11,9 @@
 namespace vla::lower {
 namespace {
 
-class CpuLayouts final : Layouts {
+class CpuLayouts final : Layouts<CpuLowering> {
  public:
-  explicit CpuLayouts(CpuLowering& lowering) : Layouts(lowering), l(lowering) {}
+  explicit CpuLayouts(CpuLowering& lowering) : Layouts(lowering) {}
 
   void run(std::vector<FusedOp> ops) {
     for (FusedOp& op : ops) {
@@ -30,9 +30,6 @@ class CpuLayouts final : Layouts {
   }
 
  private:
-  void add(Step step, CopyOp copy) override { l.ops.push_back({std::move(step), std::move(copy)}); }
-  void add(Step step, RoundOp round) override { l.ops.push_back({std::move(step), std::move(round)}); }
-
   template <class Op>
   void choose(Step& step, Op& op) {
     meet(step, op.operands());
@@ -103,7 +100,6 @@ class CpuLayouts final : Layouts {
            x.offset % d + (x.shape[1] - 1) * x.stride[1] + x.shape[0] <= d;
   }
 
-  CpuLowering& l;
   // For each base: the operations that read it or a view of it, and the value with its views.
   std::map<ValueId, std::vector<std::pair<const CpuOp*, ValueId>>> reads_;
   std::map<ValueId, std::vector<Value*>> views_;

@@ -20,9 +20,9 @@ bool is_of_strips(std::int64_t n_row, std::int64_t depth) {
   return n_row > cuda::kBf16FewRows && n_row <= 64 && depth % 8 == 0;
 }
 
-class CudaLayouts final : Layouts {
+class CudaLayouts final : Layouts<CudaLowering> {
  public:
-  explicit CudaLayouts(CudaLowering& lowering) : Layouts(lowering), l(lowering) {}
+  explicit CudaLayouts(CudaLowering& lowering) : Layouts(lowering) {}
 
   void run(std::vector<FusedOp> ops) {
     for (FusedOp& op : ops) std::visit([&](auto& what) { choose(op, what); }, op.op);
@@ -41,8 +41,6 @@ class CudaLayouts final : Layouts {
   }
 
  private:
-  void add(Step step, CopyOp copy) override { l.ops.push_back({std::move(step), std::move(copy)}); }
-  void add(Step step, RoundOp round) override { l.ops.push_back({std::move(step), std::move(round)}); }
   ValueId add_rows(const Shape& shape, DType type = DType::f32) { return add_value(shape, type, shape[0]); }
 
   template <class Op>
@@ -214,7 +212,6 @@ class CudaLayouts final : Layouts {
     split(made, plan.n_split, (q[0] + 2) * q[1] * q[2] * q[3]);
   }
 
-  CudaLowering& l;
   std::map<ValueId, std::pair<ValueId, ValueId>> keys_;
   std::map<ValueId, int> n_reader_;  // readers of each base and its views
 };
