@@ -11,7 +11,6 @@
 #include "kernels/attention_kernel.h"
 #include "kernels/pages.h"
 #include "lower/cpu/cpu_program.h"
-#include "lower/cpu/precision.h"
 #include "lower/host/weight_plan.h"
 
 namespace vla::lower {
