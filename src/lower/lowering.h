@@ -86,6 +86,8 @@ std::size_t stage_of(const Lowering& l, const Step& step);
 Shape contiguous_strides(const Shape& shape);
 /// The sizes or strides of x, in the order of the result's dimensions.
 Shape permuted(const Shape& of_x, const op::Permute& permute);
+/// The strides of x repeated along the dimensions in which it has one element.
+Shape repeated_strides(const Value& x);
 bool is_contiguous(const Shape& shape, const Shape& stride);
 inline bool is_contiguous(const Value& value) { return is_contiguous(value.shape, value.stride); }
 /// Copies the elements of a value into contiguous memory.
