@@ -31,7 +31,7 @@ class Fuser {
         if (read.id != kNone) op.reads.push_back(read.id);
       if (const auto* linear = std::get_if<LinearOp>(&op.op)) op.matrices = matrices_of(linear->linears);
     }
-    std::stable_sort(ops_.begin(), ops_.end(), [](const FusedOp& a, const FusedOp& b) { return a.order < b.order; });
+    std::ranges::stable_sort(ops_, {}, &FusedOp::order);
     return std::move(ops_);
   }
 

@@ -118,9 +118,7 @@ void arrange(Lowering& l, std::vector<TargetOp>& ops) {
   schedule(l, steps);
   place(l, steps);
   split(l, steps);
-  std::stable_sort(ops.begin(), ops.end(), [](const Step& a, const Step& b) {
-    return std::pair(a.phase, a.order) < std::pair(b.phase, b.order);
-  });
+  std::ranges::stable_sort(ops, {}, [](const Step& step) { return std::pair(step.phase, step.order); });
 }
 
 /// The address of each base, from those of the arena and of the program's own memory. of_param: the address of a

@@ -293,7 +293,7 @@ Status CudaQueue::capture(const CudaPart& part) {
 }
 
 void CudaQueue::forget(const CudaPart& part) {
-  const auto has = [&](const Parts& parts) { return std::find(parts.begin(), parts.end(), &part) != parts.end(); };
+  const auto has = [&](const Parts& parts) { return std::ranges::find(parts, &part) != parts.end(); };
   if (failure_ && (has(pending_) || has(launched_))) {
     static_cast<void>(keep(launch()));
     static_cast<void>(keep(wait()));

@@ -66,13 +66,9 @@ std::string kernel_name(MatrixKind kind) {
   return std::string("linear_") + kNames[static_cast<int>(kind)];
 }
 
-bool CudaWeights::has(MatrixKind kind) const {
-  return std::any_of(all_.begin(), all_.end(), [&](const CudaWeight& weight) { return weight.kind == kind; });
-}
+bool CudaWeights::has(MatrixKind kind) const { return std::ranges::find(all_, kind, &CudaWeight::kind) != all_.end(); }
 
-bool CudaWeights::has_codes() const {
-  return std::any_of(all_.begin(), all_.end(), [](const CudaWeight& weight) { return is_of_codes(weight.kind); });
-}
+bool CudaWeights::has_codes() const { return std::ranges::any_of(all_, is_of_codes, &CudaWeight::kind); }
 
 std::size_t CudaWeights::size_of(const Param& matrix) const {
   return device_aligned(place_of(matrix, (*this)[matrix]).size_of(matrix));
