@@ -38,8 +38,7 @@ void join(CpuLowering& l, CpuOp& up, CpuOp& down, std::int64_t n_block, std::vec
   l.value(inner).placement = Value::Placement::thread;
   CpuOp both;
   both.reads = up.reads, both.writes = down.writes, both.matrices = std::move(matrices), both.order = down.order;
-  std::copy_if(down.reads.begin(), down.reads.end(), std::back_inserter(both.reads),
-               [&](ValueId id) { return id != inner; });
+  std::ranges::copy_if(down.reads, std::back_inserter(both.reads), [&](ValueId id) { return id != inner; });
   BlockedOp blocked = {{}, n_block};
   blocked.products.push_back(std::move(up));
   blocked.products.push_back(std::move(down));

@@ -106,9 +106,7 @@ constexpr Loop kLoops[] = {
     {"attention_bf16_256_32", 661, 64, 123, 64, 64 * (2 * 256 + 16), 2, 8},
 };
 
-const Loop& loop_of(const std::string& kernel) {
-  return *std::find_if(std::begin(kLoops), std::end(kLoops), [&](const Loop& loop) { return kernel == loop.kernel; });
-}
+const Loop& loop_of(const std::string& kernel) { return *std::ranges::find(kLoops, kernel, &Loop::kernel); }
 
 /// The cost of an operation on a GPU.
 struct Cost {

@@ -119,14 +119,19 @@ class CudaLayouts final : Layouts<CudaLowering> {
   }
   /// Whether one block computes columns of both gate and up.
   bool multiplies_both(const LinearOp& op, std::int64_t n_row) const {
-    return std::all_of(op.linears.begin(), op.linears.end(), [&](const Node* node) {
-      return l.matrix(*node).kind == MatrixKind::bf16 &&
-             (is_of_strips(n_row, l.value(op.x).shape[0]) || (l.is_hopper && n_row > 64));
-    });
+    const bool has_kernel = is_of_strips(n_row, l.value(op.x).shape[0]) || (l.is_hopper && n_row > 64);
+    const auto is_bf16 = [&](const Node* node) { return l.matrix(*node).kind == MatrixKind::bf16; };
+    return has_kernel && std::ranges::all_of(op.linears, is_bf16);
   }
   /// Adds the value for partial results if there are several shares. n: floats per share.
   void split(CudaOp& op, int n_split, std::int64_t n) {
     if (n_split > 1) op.writes.push_back(op.partial = add_rows({n, n_split, 1, 1}));
+  }
+  /// The operation whose first result is this value, or null.
+  CudaOp* maker_of(ValueId id) {
+    const auto makes = [&](const CudaOp& op) { return !op.writes.empty() && op.writes[0] == id; };
+    const auto maker = std::ranges::find_if(l.ops, makes);
+    return maker != l.ops.end() ? &*maker : nullptr;
   }
   /// Stores the result of a product, attention or window rounded if `round` is its only reader.
   void round_at_once(CudaOp& round, const RoundOp& what) {
@@ -134,9 +139,8 @@ class CudaLayouts final : Layouts<CudaLowering> {
     const bool is_whole =
         x.base == what.x && x.placement == Value::Placement::arena && x.node != nullptr && !x.node->tapped;
     if (what.norm != nullptr || to.type != DType::bf16 || !is_whole || n_reader_[what.x] != 1) return;
-    const auto maker = std::find_if(l.ops.begin(), l.ops.end(),
-                                    [&](const CudaOp& op) { return !op.writes.empty() && op.writes[0] == what.x; });
-    if (maker == l.ops.end()) return;
+    CudaOp* const maker = maker_of(what.x);
+    if (maker == nullptr) return;
     const bool is_attention = std::holds_alternative<AttentionOp>(maker->op) && x.shape[0] % 8 == 0;
     const bool is_other = std::holds_alternative<LinearOp>(maker->op) || std::holds_alternative<WindowOp>(maker->op);
     if (!is_attention && !is_other) return;
@@ -153,10 +157,8 @@ class CudaLayouts final : Layouts<CudaLowering> {
     if (rows.norm != nullptr || rows.rope != nullptr || l.value(to).type != DType::bf16 || !is_whole ||
         n_reader_[x.base] != 1)
       return;
-    const auto maker = std::find_if(l.ops.begin(), l.ops.end(), [&](const CudaOp& op) {
-      return !op.writes.empty() && op.writes[0] == x.base && std::holds_alternative<LinearOp>(op.op);
-    });
-    if (maker == l.ops.end()) return;
+    CudaOp* const maker = maker_of(x.base);
+    if (maker == nullptr || !std::holds_alternative<LinearOp>(maker->op)) return;
     const Shape rows_of_product = l.value(x.base).shape;
     maker->writes[0] = add_rows(rows_of_product, DType::bf16);
     l.value(to).base = maker->writes[0];
@@ -168,17 +170,16 @@ class CudaLayouts final : Layouts<CudaLowering> {
     const Value& x = l.value(what.x);
     const bool is_whole = x.base == what.x && x.placement == Value::Placement::arena && !is_tapped(what.x);
     if (what.norm == nullptr || !is_whole || x.shape[0] > cuda::kMostFinished) return;
-    const auto maker =
-        std::find_if(l.ops.begin(), l.ops.end(), [&](const CudaOp& op) { return op.writes[0] == what.x; });
-    if (maker == l.ops.end() || !leaves_plain_shares(*maker)) return;
+    CudaOp* const maker = maker_of(what.x);
+    if (maker == nullptr || !leaves_plain_shares(*maker)) return;
     const auto reads_first = [&](const CudaOp& op) {
       return std::pair(op.order, &op) < std::pair(norm.order, static_cast<const CudaOp*>(&norm)) &&
-             std::any_of(op.reads.begin(), op.reads.end(), [&](ValueId id) { return l.value(id).base == what.x; });
+             std::ranges::any_of(op.reads, [&](ValueId id) { return l.value(id).base == what.x; });
     };
-    if (std::any_of(l.ops.begin(), l.ops.end(), reads_first)) return;
+    if (std::ranges::any_of(l.ops, reads_first)) return;
     norm.finishes = std::make_shared<const CudaOp>(*maker);
     maker->writes = {maker->partial};
-    std::replace(norm.reads.begin(), norm.reads.end(), what.x, maker->partial);
+    std::ranges::replace(norm.reads, what.x, maker->partial);
     const auto& product = std::get<LinearOp>(maker->op);
     for (const ValueId id : {product.factor, product.residual})
       if (id != kNone) norm.reads.push_back(id);
@@ -195,7 +196,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
   }
   /// Whether a value or a view of it is tapped.
   bool is_tapped(ValueId base) const {
-    return std::any_of(l.values.begin(), l.values.end(), [&](const Value& value) {
+    return std::ranges::any_of(l.values, [&](const Value& value) {
       return value.base == base && value.node != nullptr && value.node->tapped;
     });
   }

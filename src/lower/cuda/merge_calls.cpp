@@ -28,8 +28,8 @@ bool is_heads(const Calls& calls) { return calls.size() == 1 && calls[0].how.ker
 /// The Hopper tile of a bf16 product, if a kernel computes several products with this tile and no other operation adds
 /// the product's shares; else null.
 const cuda::HopperTile* tile_of(const Calls& calls) {
-  const auto* tile = std::find_if(std::begin(cuda::kHopperTiles), std::end(cuda::kHopperTiles),
-                                  [&](const auto& one) { return calls[0].how.kernel == std::string_view(one.kernel); });
+  const std::string_view kernel = calls[0].how.kernel;
+  const auto* tile = std::ranges::find(cuda::kHopperTiles, kernel, &cuda::HopperTile::kernel);
   if (tile == std::end(cuda::kHopperTiles) || tile->several == nullptr) return nullptr;
   return (job_of<cuda::LinearBf16Job>(calls[0]).n_split > 1) == (calls.size() == 2) ? tile : nullptr;
 }
