@@ -50,7 +50,7 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
   std::vector<std::size_t> stage_end(stages.size(), 0);  // one past the last phase of each stage
   for (const CpuOp& op : l.ops) {
     const auto phase = static_cast<std::size_t>(op.phase);
-    CpuRun run = run_of(l, op);
+    CpuRun run = std::visit([&](const auto& what) { return run_of(l, op, what); }, op.op);
     scratch = std::max(scratch, run.scratch);
     const std::string text = text_of(l, op, run);
     uses_[phase].insert(uses_[phase].end(), run.matrices.begin(), run.matrices.end());

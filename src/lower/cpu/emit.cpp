@@ -60,10 +60,6 @@ kernels::Window window_of(const Shape& x, const op::Window& window, const Shape&
 
 int threads_for(const CpuLowering& l, double flop) { return flop < kMinSharedFlop ? 1 : l.n_thread; }
 
-CpuRun run_of(const CpuLowering& l, const CpuOp& op) {
-  return std::visit([&](const auto& what) { return run_of(l, op, what); }, op.op);
-}
-
 std::string text_of(const CpuLowering& l, const CpuOp& op, const CpuRun& run) {
   return std::visit([&](const auto& what) { return lines_of(l, op, run, what); }, op.op);
 }

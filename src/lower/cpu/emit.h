@@ -35,14 +35,13 @@ struct CpuRun {
   std::unique_ptr<Task> task;  // for the executor; all addresses are set except those of matrices
   MatrixUses matrices = {};    // matrices whose addresses are set before a run
 };
+/// Requires that every value has an address.
 #define VLA_RUN_OP(Op) CpuRun run_of(const CpuLowering& l, const CpuOp& op, const Op& what);
 VLA_LOWERED_OPS(VLA_RUN_OP)
 VLA_RUN_OP(PackOp)
 VLA_RUN_OP(BlockedOp)
 #undef VLA_RUN_OP
 
-/// Requires that every value has an address.
-CpuRun run_of(const CpuLowering& l, const CpuOp& op);
 /// FLOP and bytes of an operation.
 Work work_of(const CpuLowering& l, const CpuOp& op);
 /// Prints an operation: text, kernel, shapes and layouts.

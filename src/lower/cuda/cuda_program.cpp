@@ -60,9 +60,11 @@ Result<std::vector<int>> CudaProgram::make_parts(const CudaLowering& l) {
   std::vector<std::vector<Calls>> phases(static_cast<std::size_t>(l.n_phase));
   reads_.resize(phases.size());
   for (const CudaOp& op : l.ops) {
-    VLA_TRY(Calls calls, emit(l, op));
-    if (!op.invariant) work_[stage_of(l, op)] += work_of(l, op);
-    text_ += text_of(l, op, calls);
+    VLA_TRY(Calls calls, std::visit([&](const auto& what) { return calls_of(l, op, what); }, op.op));
+    const std::string text = std::visit([](const auto& what) { return what.text(); }, op.op);
+    const Work work = work_of(l, op);
+    if (!op.invariant) work_[stage_of(l, op)] += work;
+    text_ += line_of(l, op, calls.empty() ? "nothing" : calls.front().how.kernel, text, work) + "\n";
     n_launch.push_back(static_cast<int>(calls.size()));
     const auto phase = static_cast<std::size_t>(op.phase);
     phases[phase].push_back(std::move(calls));

@@ -17,9 +17,6 @@ VLA_LOWERED_OPS(VLA_CALLS_OF_OP)
 VLA_CALLS_OF_OP(HeadOp)
 #undef VLA_CALLS_OF_OP
 
-Result<Calls> emit(const CudaLowering& l, const CudaOp& op);
-/// The operation's line of Program::text.
-std::string text_of(const CudaLowering& l, const CudaOp& op, const Calls& calls);
 /// Merges independent operations of a phase, such as those of q, k and v, into one kernel: products in strips or Hopper
 /// tiles with equal rows, depth and shares, and operations on rows of heads. n_sm: SMs of the device.
 void merge_calls(std::vector<Calls>& phase, int n_sm);
