@@ -118,6 +118,7 @@ class CudaQueue {
 
   Status grow(HostMemory& memory, std::size_t size);
   Status stage(cuda::Address to, const void* from, std::size_t size);
+  bool join(cuda::Address to, const void* from, std::size_t size);
   Result<std::shared_ptr<HostBlock>> block_of(const void* from);
   Result<std::shared_ptr<HostBlock>> make_block(std::size_t size);
   Status copy(cuda::Address to, const CudaSent& sent, std::size_t size);
