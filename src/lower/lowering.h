@@ -82,6 +82,7 @@ struct Lowering {
 
 /// The index of the stage in which the operation's node was recorded.
 std::size_t stage_of(const Lowering& l, const Step& step);
+inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]; }
 /// Strides of contiguous elements.
 Shape contiguous_strides(const Shape& shape);
 /// The sizes or strides of x, in the order of the result's dimensions.

@@ -29,7 +29,6 @@ Call call(const cuda::Launch& how, const Job& job) {
   return {how, {bytes, bytes + sizeof(job)}};
 }
 inline int narrow(std::int64_t n) { return static_cast<int>(n); }
-inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]; }
 /// `more` precedes the limit `most` in the message, such as "heads of at most".
 Error unsupported(const char* what, const char* more, std::int64_t most, std::int64_t found);
 

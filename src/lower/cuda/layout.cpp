@@ -70,7 +70,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
   void choose(Step& step, LinearOp& op) {
     const MatrixKind kind = l.matrix(*op.linears[0]).kind;
     const Shape y = op.linears[0]->shape;
-    const std::int64_t depth = l.value(op.x).shape[0], n_row = count(y) / y[0];
+    const std::int64_t depth = l.value(op.x).shape[0], n_row = rows_of(y);
     const bool is_one = op.gated && multiplies_both(op, n_row);
     const ProductCut cut = cut_product(l, kind, n_row, is_one ? 2 * y[0] : y[0], depth, is_one);
     if (is_of_codes(kind))
@@ -107,7 +107,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     for (const std::size_t i : all) n_column += columns_of(i), apart += l.ops[i].cut.us;
     const auto& product = std::get<LinearOp>(l.ops[first].op);
     const Shape& y = product.linears[0]->shape;
-    const std::int64_t n_row = count(y) / y[0], depth = l.value(product.x).shape[0];
+    const std::int64_t n_row = rows_of(y), depth = l.value(product.x).shape[0];
     ProductCut cut = cut_product(l, MatrixKind::bf16, n_row, n_column, depth, false);
     if (cut.tile) cut = cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::several, l.n_sm);
     const bool is_one_launch = cut.tile || (strip_width(cut.shape) > 0 && cut.n_split == 1);
