@@ -13,18 +13,22 @@ std::size_t at(const Node* node) { return static_cast<std::size_t>(node->id); }
 
 class Fuser {
  public:
-  explicit Fuser(Lowering& lowering) : l(lowering) {}
+  explicit Fuser(Lowering& lowering) : l(lowering), readers_(needed_.size()), fused_(needed_.size(), false) {
+    for (const Node& node : l.graph.nodes())
+      if (needed_[at(&node)])
+        for (Tensor in : node.in) readers_[at(in.node())].push_back(&node);
+  }
 
   std::vector<FusedOp> run() {
     for (const Node& node : l.graph.nodes())
-      if (l.needed[at(&node)] && !l.fused[at(&node)]) std::visit([&](const auto& op) { visit(node, op); }, node.op);
+      if (needed_[at(&node)] && !fused_[at(&node)]) std::visit([&](const auto& op) { visit(node, op); }, node.op);
     join_products();
     fuse_readings();
     // A norm or a window that its readers compute needs no operation of its own.
     std::erase_if(ops_, [&](const FusedOp& op) {
       const auto* row = std::get_if<RowOp>(&op.op);
       const auto* window = std::get_if<WindowOp>(&op.op);
-      return (row != nullptr && l.fused[at(row->node)]) || (window != nullptr && l.fused[at(window->node)]);
+      return (row != nullptr && fused_[at(row->node)]) || (window != nullptr && fused_[at(window->node)]);
     });
     for (FusedOp& op : ops_) {
       for (const Operand& read : std::visit([](auto& what) { return what.operands(); }, op.op))
@@ -53,9 +57,9 @@ class Fuser {
 
   /// Returns the only reader of a node, or null if it has several, is tapped, or the reader was fused already.
   const Node* only_reader(const Node& node) const {
-    if (node.tapped || l.readers[at(&node)].size() != 1) return nullptr;
-    const Node* reader = l.readers[at(&node)][0];
-    return l.fused[at(reader)] ? nullptr : reader;
+    if (node.tapped || readers_[at(&node)].size() != 1) return nullptr;
+    const Node* reader = readers_[at(&node)][0];
+    return fused_[at(reader)] ? nullptr : reader;
   }
   /// The same for a reader of one kind.
   template <class Op>
@@ -101,7 +105,7 @@ class Fuser {
   }
 
   const Node* take(const Node* node) {
-    l.fused[at(node)] = true;
+    fused_[at(node)] = true;
     return node;
   }
 
@@ -136,7 +140,7 @@ class Fuser {
   /// Operations of their own exist already and are removed at the end.
   HeadRows prepared(Tensor x) {
     HeadRows result = {x.node()->id};
-    const auto is_only = [&](const Node* node) { return !node->tapped && l.readers[at(node)].size() == 1; };
+    const auto is_only = [&](const Node* node) { return !node->tapped && readers_[at(node)].size() == 1; };
     const Node* node = x.node();
     if (node->as<op::Rope>() != nullptr && is_only(node)) {
       result.rope = take(node), result.table = operand(*node, 1);
@@ -220,13 +224,16 @@ class Fuser {
         const Multiplier by = multiplier(*reader);
         return is_norm ? read->shape[0] <= by.max_norm : by.takes_windows;
       };
-      if ((!is_norm && !is_window) || !std::ranges::all_of(l.readers[at(read)], takes)) continue;
+      if ((!is_norm && !is_window) || !std::ranges::all_of(readers_[at(read)], takes)) continue;
       (is_norm ? linear->norm : linear->unfold) = take(read), linear->x = operand(*read, 0);
       if (is_norm) linear->norm_weight = operand(*read, 1), linear->norm_bias = operand(*read, 2);
     }
   }
 
   Lowering& l;
+  const std::vector<bool> needed_ = l.graph.needed();
+  std::vector<std::vector<const Node*>> readers_;  // needed readers of each node
+  std::vector<bool> fused_;                        // nodes that another node's operation computes
   std::vector<FusedOp> ops_;
   std::map<std::tuple<ValueId, ValueId, bool>, ValueId> packs_;
 };

@@ -63,11 +63,8 @@ struct Lowering {
   const Target& target;
 
   std::vector<Value> values = {};
-  std::vector<std::vector<const Node*>> readers = {};  // readers of each needed node
-  std::vector<bool> needed = {};                       // Graph::needed
-  std::vector<bool> fused = {};                        // nodes that another node's operation computes
-  int n_prepare = 0, n_phase = 0;                      // phases of Program::prepare; of prepare and run together
-  std::size_t arena_size = 0, kept_size = 0;           // kept: results of prepare, and constants
+  int n_prepare = 0, n_phase = 0;             // phases of Program::prepare; of prepare and run together
+  std::size_t arena_size = 0, kept_size = 0;  // kept: results of prepare, and constants
 
   const Node* node(ValueId id) const { return values[static_cast<std::size_t>(id)].node; }
   Value& value(ValueId id) { return values[static_cast<std::size_t>(id)]; }
@@ -100,7 +97,7 @@ const void* constant_of(const Value& value);
 /// The operand of a node, or kNone.
 inline ValueId operand(const Node& node, std::size_t i) { return i < node.in.size() ? node.in[i].node()->id : kNone; }
 
-/// Finds the needed nodes, and makes a value of every node: memory of its own, or a view.
+/// Makes a value of every node: memory of its own, or a view.
 void start(Lowering& l);
 /// Puts steps that do not depend on each other into one phase, and invariant steps into Program::prepare.
 void schedule(Lowering& l, std::vector<Step*> steps);

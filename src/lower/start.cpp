@@ -1,6 +1,5 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 #include <optional>
 
 #include "lower/lowering.h"
@@ -138,15 +137,7 @@ struct MakeValue {
 }  // namespace
 
 void start(Lowering& l) {
-  const auto& nodes = l.graph.nodes();
-  l.needed = l.graph.needed();
-  l.fused.assign(nodes.size(), false);
-  l.readers.resize(nodes.size());
-  for (auto node = nodes.rbegin(); node != nodes.rend(); ++node) {
-    if (!l.needed[static_cast<std::size_t>(node->id)]) continue;
-    for (Tensor in : node->in) l.readers[static_cast<std::size_t>(in.node()->id)].push_back(&*node);
-  }
-  for (const Node& node : nodes) l.values.push_back(std::visit(MakeValue{l, node}, node.op));
+  for (const Node& node : l.graph.nodes()) l.values.push_back(std::visit(MakeValue{l, node}, node.op));
 }
 
 }  // namespace vla::lower

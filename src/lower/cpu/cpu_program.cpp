@@ -98,9 +98,6 @@ Status CpuProgram::cut(const CpuWeights& weights) {
   return {};
 }
 
-Status CpuProgram::prepare() { return run(prepare_); }
-Status CpuProgram::run() { return run(run_); }
-
 /// Copies the matrices' current addresses from the table into the tasks.
 void CpuProgram::bind() const {
   for (const MatrixUses& phase : uses_)
