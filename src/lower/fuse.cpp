@@ -215,7 +215,7 @@ class Fuser {
   void fuse_readings() {
     for (FusedOp& op : ops_) {
       auto* linear = std::get_if<LinearOp>(&op.op);
-      const Node* read = linear != nullptr ? l.node(linear->x) : nullptr;
+      const Node* read = linear != nullptr ? l.value(linear->x).node : nullptr;
       if (read == nullptr || read->tapped) continue;
       const bool is_norm = read->as<op::Norm>() != nullptr && row_stride(l.value(operand(*read, 0))) >= 0;
       const bool is_window = read->as<op::Unfold>() != nullptr;

@@ -66,7 +66,6 @@ struct Lowering {
   int n_prepare = 0, n_phase = 0;             // phases of Program::prepare; of prepare and run together
   std::size_t arena_size = 0, kept_size = 0;  // kept: results of prepare, and constants
 
-  const Node* node(ValueId id) const { return values[static_cast<std::size_t>(id)].node; }
   Value& value(ValueId id) { return values[static_cast<std::size_t>(id)]; }
   const Value& value(ValueId id) const { return values[static_cast<std::size_t>(id)]; }
   Value& base(ValueId id) { return value(value(id).base); }

@@ -27,7 +27,7 @@ Multiplier multiplier_of(const CudaWeight& weight) {
 Result<std::unique_ptr<Device>> CudaDevice::open(const cuda::Driver& driver, int index,
                                                  const std::vector<std::string>& modules, Rounding at_load) {
   VLA_TRY(std::shared_ptr<CudaQueue> queue, CudaQueue::open(driver, index, modules));
-  const std::string name = "cuda:" + std::to_string(index) + ", " + queue->device_name();
+  const std::string name = "cuda:" + std::to_string(index) + ", " + queue->gpu()->name();
   return std::unique_ptr<Device>(new CudaDevice(name, std::move(queue), at_load));
 }
 

@@ -55,8 +55,6 @@ class CudaQueue {
   int n_sm() const { return n_sm_; }
   /// Whether the device runs Hopper kernels (sm_90a).
   bool is_hopper() const { return is_hopper_; }
-  /// The device's name, from the driver.
-  std::string device_name() const { return gpu_ ? gpu_->name() : ""; }
   const Status& failure() const { return failure_; }
   /// Dry: from now on nothing is allocated and writes are skipped.
   void set_dry(bool dry) { is_dry_ = dry; }
