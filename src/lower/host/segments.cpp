@@ -45,6 +45,7 @@ std::vector<Segment> cut_phases(std::span<const Groups> phases, std::size_t begi
   };
   for (std::size_t i = 0; i < phases.size(); ++i) {
     if (!phases[i].any()) continue;
+    // A phase whose groups the last segment holds extends it, with the phases between.
     if (segments.empty() || !segments.back().groups.holds(phases[i])) {
       go_to(begin + i, phases[i]);
       segments.push_back({begin + i, begin + i, phases[i]});
