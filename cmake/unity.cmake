@@ -23,13 +23,6 @@ function(vla_optimize_little target)
   endif()
 endfunction()
 
-# For code that plans what kernels compute, or shows it: a quarter less to compile. Sanitized code has as little anyway.
-function(vla_optimize_less target)
-  if(NOT VLA_SANITIZE)
-    target_compile_options(${target} PRIVATE -O1)
-  endif()
-endfunction()
-
 function(vla_precompile target)
   if(VLA_UNITY)
     target_precompile_headers(${target} PRIVATE ${ARGN})

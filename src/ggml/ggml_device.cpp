@@ -307,7 +307,7 @@ Result<WeightPlan> GgmlDevice::plan_weights(const Program& prefix, const Program
   if (is_host()) return Device::plan_weights(prefix, step, size);
   const auto &first = static_cast<const GgmlProgram&>(prefix), &then = static_cast<const GgmlProgram&>(step);
   return lower::plan_streams(
-      {{}, first.reads(), then.reads(), [&](const Param& matrix) { return size_of(matrix); }, weights_size_}, size);
+      {first.reads(), then.reads(), 0, [&](const Param& matrix) { return size_of(matrix); }, weights_size_}, size);
 }
 
 std::size_t GgmlDevice::working_size() const {

@@ -64,4 +64,17 @@ Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::
                kernels, "other kernels are the CPU's"};
 }
 
+Features features_for(const ParamList& list, Features use, Rounding rounding) {
+  const auto rounds = [&](const Param& param) {
+    const DType type = resident_encoding(param, rounding).type;
+    return param.storage == Storage::matrix && (type == DType::bf16 || type == DType::i8 || type == DType::int4);
+  };
+  return std::ranges::any_of(list.params(), rounds) ? use : without_rounding(use);
+}
+
+std::int64_t min_rounded_keys(const ParamList& list) {
+  const auto is_ternary = [](const Param& param) { return param.encoding.type == DType::ternary; };
+  return std::ranges::any_of(list.params(), is_ternary) ? 512 : 128;
+}
+
 }  // namespace vla

@@ -13,36 +13,35 @@ std::size_t at(const Node* node) { return static_cast<std::size_t>(node->id); }
 
 class Fuser {
  public:
-  explicit Fuser(Lowering& lowering) : l(lowering) {}
+  explicit Fuser(Lowering& lowering) : l(lowering), readers_(needed_.size()), fused_(needed_.size(), false) {
+    for (const Node& node : l.graph.nodes())
+      if (needed_[at(&node)])
+        for (Tensor in : node.in) readers_[at(in.node())].push_back(&node);
+  }
 
   std::vector<FusedOp> run() {
     for (const Node& node : l.graph.nodes())
-      if (l.needed[at(&node)] && !l.fused[at(&node)]) visit(node);
+      if (needed_[at(&node)] && !fused_[at(&node)]) std::visit([&](const auto& op) { visit(node, op); }, node.op);
     join_products();
     fuse_readings();
     // A norm or a window that its readers compute needs no operation of its own.
     std::erase_if(ops_, [&](const FusedOp& op) {
       const auto* row = std::get_if<RowOp>(&op.op);
       const auto* window = std::get_if<WindowOp>(&op.op);
-      return (row != nullptr && l.fused[at(row->node)]) || (window != nullptr && l.fused[at(window->node)]);
+      return (row != nullptr && fused_[at(row->node)]) || (window != nullptr && fused_[at(window->node)]);
     });
     for (FusedOp& op : ops_) {
       for (const Operand& read : std::visit([](auto& what) { return what.operands(); }, op.op))
         if (read.id != kNone) op.reads.push_back(read.id);
       if (const auto* linear = std::get_if<LinearOp>(&op.op)) op.matrices = matrices_of(linear->linears);
     }
-    std::stable_sort(ops_.begin(), ops_.end(), [](const FusedOp& a, const FusedOp& b) { return a.order < b.order; });
+    std::ranges::stable_sort(ops_, {}, &FusedOp::order);
     return std::move(ops_);
   }
 
  private:
   void add(decltype(FusedOp::op) op, const Node& result) {
-    FusedOp& added = ops_.emplace_back();
-    added.op = std::move(op), added.writes = {result.id}, added.order = result.id;
-  }
-
-  void visit(const Node& node) {
-    std::visit([&](const auto& op) { visit(node, op); }, node.op);
+    ops_.push_back({{.writes = {result.id}, .order = result.id}, std::move(op)});
   }
 
   // Leaves are values, not operations; writes to slots are handled in store.cpp.
@@ -51,8 +50,6 @@ class Fuser {
   void visit(const Node&, const op::Parameter&) {}
   void visit(const Node&, const op::Write&) {}
 
-  void visit(const Node& node, const op::Linear&) { visit_linear(node); }
-  void visit(const Node& node, const op::Attention&) { visit_attention(node); }
   template <class Op>
   void visit(const Node& node, const Op& op) {
     if (l.value(node.id).base == node.id) add(lowered(l, node, op), node);  // else it is a view
@@ -60,10 +57,18 @@ class Fuser {
 
   /// Returns the only reader of a node, or null if it has several, is tapped, or the reader was fused already.
   const Node* only_reader(const Node& node) const {
-    if (node.tapped || l.readers[at(&node)].size() != 1) return nullptr;
-    const Node* reader = l.readers[at(&node)][0];
-    return l.fused[at(reader)] ? nullptr : reader;
+    if (node.tapped || readers_[at(&node)].size() != 1) return nullptr;
+    const Node* reader = readers_[at(&node)][0];
+    return fused_[at(reader)] ? nullptr : reader;
   }
+  /// The same for a reader of one kind.
+  template <class Op>
+  const Node* only_reader(const Node& node) const {
+    const Node* reader = only_reader(node);
+    return reader != nullptr && reader->as<Op>() != nullptr ? reader : nullptr;
+  }
+  /// The other operand of a sum or product of two.
+  static Tensor other_operand(const Node& of, const Node* than) { return of.in[of.in[0].node() == than ? 1 : 0]; }
 
   Multiplier multiplier(const Node& linear) const { return l.target.multiplier(*linear.as<op::Linear>()->weight); }
   static std::vector<const Param*> matrices_of(const std::vector<const Node*>& linears) {
@@ -78,36 +83,29 @@ class Fuser {
     return has_kernel && share_group(l, matrices_of(linears));
   }
 
-  void visit_linear(const Node& linear) {
+  void visit(const Node& linear, const op::Linear&) {
     LinearOp op;
     op.linears = {&linear}, op.x = linear.in[0].node()->id;
+    if (const Node* gated = fuse_gate(linear, op)) return add(std::move(op), *gated);
     const Node* result = &linear;
-    if (const Node* gated = fuse_gate(linear, op)) {
-      result = gated;
-    } else {
-      if (const Node* next = only_reader(*result); next != nullptr && next->as<op::Activate>() != nullptr)
-        op.activation = next->as<op::Activate>()->activation, result = take(next);
-      if (const Node* next = only_reader(*result); next != nullptr && next->as<op::Multiply>() != nullptr &&
-                                                   next->in[0].node() == result && is_vector(next->in[1], *result))
-        op.factor = next->in[1].node()->id, result = take(next);
-      if (const Node* next = only_reader(*result); next != nullptr && next->as<op::Add>() != nullptr) {
-        const Tensor other = next->in[next->in[0].node() == result ? 1 : 0];
-        if (other.shape() == result->shape) op.residual = other.node()->id, result = take(next);
-      }
-      if (op.residual != kNone && multiplier(linear).takes_relu)
-        if (const Node* next = only_reader(*result); next != nullptr && is_relu(*next))
-          op.ends_in_relu = true, result = take(next);
+    if (const Node* next = only_reader<op::Activate>(*result))
+      op.activation = next->as<op::Activate>()->activation, result = take(next);
+    if (const Node* next = only_reader<op::Multiply>(*result);
+        next != nullptr && next->in[0].node() == result && is_vector(next->in[1], *result))
+      op.factor = next->in[1].node()->id, result = take(next);
+    if (const Node* next = only_reader<op::Add>(*result)) {
+      const Tensor other = other_operand(*next, result);
+      if (other.shape() == result->shape) op.residual = other.node()->id, result = take(next);
     }
+    if (op.residual != kNone && multiplier(linear).takes_relu)
+      if (const Node* next = only_reader<op::Activate>(*result);
+          next != nullptr && next->as<op::Activate>()->activation == Activation::relu)
+        op.ends_in_relu = true, result = take(next);
     add(std::move(op), *result);
   }
 
-  static bool is_relu(const Node& node) {
-    const auto* activate = node.as<op::Activate>();
-    return activate != nullptr && activate->activation == Activation::relu;
-  }
-
   const Node* take(const Node* node) {
-    l.fused[at(node)] = true;
+    fused_[at(node)] = true;
     return node;
   }
 
@@ -119,12 +117,11 @@ class Fuser {
 
   /// Matches activation(gate) * up, where `linear` is one of the two products and both read the same x.
   const Node* fuse_gate(const Node& linear, LinearOp& op) {
-    const Node* next = only_reader(linear);
-    const Node* activate = next != nullptr && next->as<op::Activate>() != nullptr ? next : nullptr;
-    const Node* product = activate != nullptr ? only_reader(*activate) : next;
-    if (product == nullptr || product->as<op::Multiply>() == nullptr) return nullptr;
+    const Node* activate = only_reader<op::Activate>(linear);
     const Node* self = activate != nullptr ? activate : &linear;
-    const Node* other = product->in[product->in[0].node() == self ? 1 : 0].node();
+    const Node* product = only_reader<op::Multiply>(*self);
+    if (product == nullptr) return nullptr;
+    const Node* other = other_operand(*product, self).node();
     const Node *gate = &linear, *up = other;
     if (activate == nullptr) {  // the other factor must be the activated one
       if (other->as<op::Activate>() == nullptr || only_reader(*other) != product) return nullptr;
@@ -140,28 +137,22 @@ class Fuser {
   }
 
   /// Matches a norm or rotation of heads that only this attention reads; attention applies it as it copies the rows.
+  /// Operations of their own exist already and are removed at the end.
   HeadRows prepared(Tensor x) {
     HeadRows result = {x.node()->id};
-    const auto is_only = [&](const Node* node) { return !node->tapped && l.readers[at(node)].size() == 1; };
+    const auto is_only = [&](const Node* node) { return !node->tapped && readers_[at(node)].size() == 1; };
     const Node* node = x.node();
     if (node->as<op::Rope>() != nullptr && is_only(node)) {
-      result.rope = node, result.table = operand(*node, 1);
+      result.rope = take(node), result.table = operand(*node, 1);
       node = node->in[0].node();
       result.x = node->id;
     }
     const auto* norm = node->as<op::Norm>();
     if (norm != nullptr && node->in.size() == 2 && is_only(node)) {
-      result.norm = node, result.weight = operand(*node, 1);
+      result.norm = take(node), result.weight = operand(*node, 1);
       result.x = operand(*node, 0);
     }
     return result;
-  }
-
-  /// Marks the norm and rotation that attention applies as fused; their own operations exist already and are removed at
-  /// the end.
-  void drop(const HeadRows& rows) {
-    for (const Node* node : {rows.norm, rows.rope})
-      if (node != nullptr) l.fused[at(node)] = true;
   }
 
   ValueId pack(Tensor k, Tensor v, const Node& attention, bool rounds) {
@@ -170,9 +161,7 @@ class Fuser {
     const ValueId id = static_cast<ValueId>(l.values.size());
     Value& value = l.values.emplace_back();
     value.base = id, value.shape = k.shape();
-    PackOp op = {prepared(k), v.node()->id, rounds};
-    drop(op.k);
-    add(std::move(op), attention);
+    add(PackOp{prepared(k), v.node()->id, rounds}, attention);
     ops_.back().writes = {id};
     return known->second = id;
   }
@@ -186,15 +175,13 @@ class Fuser {
     return type == DType::f32 || type == DType::f16;
   }
 
-  void visit_attention(const Node& node) {
-    const bool has_mask = node.as<op::Attention>()->has_mask;
-    const std::size_t first = has_mask ? 2 : 1;
+  void visit(const Node& node, const op::Attention& attention) {
+    const std::size_t first = attention.has_mask ? 2 : 1;
     std::int64_t n_key = 0;
     for (std::size_t i = first; i < node.in.size(); i += 2) n_key += node.in[i].dim(2);
     const bool rounds = n_key >= l.target.min_rounded_keys && !comes_from_floats(node.in[0]);
     AttentionOp op = {.node = &node, .q = prepared(node.in[0]), .rounds = rounds};
-    drop(op.q);
-    if (has_mask) op.mask = node.in[1].node()->id;
+    if (attention.has_mask) op.mask = node.in[1].node()->id;
     for (std::size_t i = first; i < node.in.size(); i += 2) {
       op.packed.push_back(pack(node.in[i], node.in[i + 1], node, rounds));
       op.n_key.push_back(node.in[i].dim(2));
@@ -228,7 +215,7 @@ class Fuser {
   void fuse_readings() {
     for (FusedOp& op : ops_) {
       auto* linear = std::get_if<LinearOp>(&op.op);
-      const Node* read = linear != nullptr ? l.node(linear->x) : nullptr;
+      const Node* read = linear != nullptr ? l.value(linear->x).node : nullptr;
       if (read == nullptr || read->tapped) continue;
       const bool is_norm = read->as<op::Norm>() != nullptr && row_stride(l.value(operand(*read, 0))) >= 0;
       const bool is_window = read->as<op::Unfold>() != nullptr;
@@ -237,13 +224,16 @@ class Fuser {
         const Multiplier by = multiplier(*reader);
         return is_norm ? read->shape[0] <= by.max_norm : by.takes_windows;
       };
-      if ((!is_norm && !is_window) || !std::ranges::all_of(l.readers[at(read)], takes)) continue;
+      if ((!is_norm && !is_window) || !std::ranges::all_of(readers_[at(read)], takes)) continue;
       (is_norm ? linear->norm : linear->unfold) = take(read), linear->x = operand(*read, 0);
       if (is_norm) linear->norm_weight = operand(*read, 1), linear->norm_bias = operand(*read, 2);
     }
   }
 
   Lowering& l;
+  const std::vector<bool> needed_ = l.graph.needed();
+  std::vector<std::vector<const Node*>> readers_;  // needed readers of each node
+  std::vector<bool> fused_;                        // nodes that another node's operation computes
   std::vector<FusedOp> ops_;
   std::map<std::tuple<ValueId, ValueId, bool>, ValueId> packs_;
 };

@@ -63,13 +63,9 @@ struct Lowering {
   const Target& target;
 
   std::vector<Value> values = {};
-  std::vector<std::vector<const Node*>> readers = {};  // readers of each needed node
-  std::vector<bool> needed = {};                       // Graph::needed
-  std::vector<bool> fused = {};                        // nodes that another node's operation computes
-  int n_prepare = 0, n_phase = 0;                      // phases of Program::prepare; of prepare and run together
-  std::size_t arena_size = 0, kept_size = 0;           // kept: results of prepare, and constants
+  int n_prepare = 0, n_phase = 0;             // phases of Program::prepare; of prepare and run together
+  std::size_t arena_size = 0, kept_size = 0;  // kept: results of prepare, and constants
 
-  const Node* node(ValueId id) const { return values[static_cast<std::size_t>(id)].node; }
   Value& value(ValueId id) { return values[static_cast<std::size_t>(id)]; }
   const Value& value(ValueId id) const { return values[static_cast<std::size_t>(id)]; }
   Value& base(ValueId id) { return value(value(id).base); }
@@ -82,10 +78,13 @@ struct Lowering {
 
 /// The index of the stage in which the operation's node was recorded.
 std::size_t stage_of(const Lowering& l, const Step& step);
+inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]; }
 /// Strides of contiguous elements.
 Shape contiguous_strides(const Shape& shape);
 /// The sizes or strides of x, in the order of the result's dimensions.
 Shape permuted(const Shape& of_x, const op::Permute& permute);
+/// The strides of x repeated along the dimensions in which it has one element.
+Shape repeated_strides(const Value& x);
 bool is_contiguous(const Shape& shape, const Shape& stride);
 inline bool is_contiguous(const Value& value) { return is_contiguous(value.shape, value.stride); }
 /// Copies the elements of a value into contiguous memory.
@@ -97,7 +96,7 @@ const void* constant_of(const Value& value);
 /// The operand of a node, or kNone.
 inline ValueId operand(const Node& node, std::size_t i) { return i < node.in.size() ? node.in[i].node()->id : kNone; }
 
-/// Finds the needed nodes, and makes a value of every node: memory of its own, or a view.
+/// Makes a value of every node: memory of its own, or a view.
 void start(Lowering& l);
 /// Puts steps that do not depend on each other into one phase, and invariant steps into Program::prepare.
 void schedule(Lowering& l, std::vector<Step*> steps);
@@ -116,9 +115,32 @@ void arrange(Lowering& l, std::vector<TargetOp>& ops) {
   schedule(l, steps);
   place(l, steps);
   split(l, steps);
-  std::stable_sort(ops.begin(), ops.end(), [](const Step& a, const Step& b) {
-    return std::pair(a.phase, a.order) < std::pair(b.phase, b.order);
-  });
+  std::ranges::stable_sort(ops, {}, [](const Step& step) { return std::pair(step.phase, step.order); });
+}
+
+/// The address of each base, from those of the arena and of the program's own memory. of_param: the address of a
+/// parameter.
+template <class Address, class OfParam>
+std::vector<Address> addresses_of(const Lowering& l, Address arena, Address own, OfParam of_param) {
+  const auto address = [&](const Value& value) -> Address {
+    switch (value.placement) {
+      case Value::Placement::arena:
+        return arena + value.begin;
+      case Value::Placement::kept:
+      case Value::Placement::constant:
+        return own + value.begin;
+      case Value::Placement::slot:
+        return reinterpret_cast<Address>(value.slot->place);
+      case Value::Placement::parameter:
+        return of_param(*value.node->as<op::Parameter>()->param);
+      case Value::Placement::thread:
+        break;  // scratch memory of each worker
+    }
+    return {};
+  };
+  std::vector<Address> all;
+  for (const Value& value : l.values) all.push_back(&l.value(value.base) == &value ? address(value) : Address{});
+  return all;
 }
 
 /// Prints an operation's line of Program::text: `what first operand -> results`.

@@ -31,16 +31,11 @@ concept LoweredOp = requires(Op op, const Op& same) {
 VLA_LOWERED_OPS(VLA_CHECK_OP)
 #undef VLA_CHECK_OP
 
-template <class, class... Ops>
-struct OpList {
-  template <class... More>
-  using With = std::variant<Ops..., More...>;
-};
-#define VLA_NEXT_OP(Op) , Op
+#define VLA_OP_AND(Op) Op,
 /// These operations, and those that a target adds.
 template <class... More>
-using AnyOp = typename OpList<void VLA_LOWERED_OPS(VLA_NEXT_OP)>::template With<More...>;
-#undef VLA_NEXT_OP
+using AnyOp = std::variant<VLA_LOWERED_OPS(VLA_OP_AND) More...>;
+#undef VLA_OP_AND
 
 /// One operation of the program, made of one or several nodes.
 struct FusedOp : Step {

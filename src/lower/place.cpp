@@ -1,6 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
+#include <functional>
 #include <numeric>
 
 #include "lower/lowering.h"
@@ -35,8 +36,7 @@ void place(Lowering& l, const std::vector<Step*>& steps) {
   const std::vector<Lifetime> lifetimes = find_lifetimes(l, steps);
   std::vector<std::size_t> order(l.values.size());
   std::iota(order.begin(), order.end(), std::size_t{0});
-  std::stable_sort(order.begin(), order.end(),
-                   [&](std::size_t a, std::size_t b) { return l.values[a].size > l.values[b].size; });
+  std::ranges::stable_sort(order, std::greater(), [&](std::size_t i) { return l.values[i].size; });
   struct Taken {
     Lifetime lifetime;
     std::size_t begin, end;
@@ -58,11 +58,8 @@ void place(Lowering& l, const std::vector<Step*>& steps) {
     for (const Taken& other : taken)
       if (other.lifetime.overlaps(lifetime) && other.begin < begin + size && other.end > begin) begin = other.end;
     value.begin = begin;
-    const Taken now = {lifetime, begin, begin + size};
-    taken.insert(std::upper_bound(taken.begin(), taken.end(), begin,
-                                  [](std::size_t b, const Taken& other) { return b < other.begin; }),
-                 now);
-    l.arena_size = std::max(l.arena_size, now.end);
+    taken.insert(std::ranges::upper_bound(taken, begin, {}, &Taken::begin), Taken{lifetime, begin, begin + size});
+    l.arena_size = std::max(l.arena_size, begin + size);
   }
   for (Value& value : l.values)
     if (value.placement == Value::Placement::constant)

@@ -14,14 +14,12 @@ void find_invariants(const Lowering& l, const std::vector<Step*>& steps) {
   std::vector<bool> varies(l.values.size(), false);
   for (const Node& node : l.graph.nodes())
     if (const auto* input = node.as<op::Input>())
-      varies[static_cast<std::size_t>(node.id)] =
-          std::find(varying.begin(), varying.end(), input->slot) != varying.end();
+      varies[static_cast<std::size_t>(node.id)] = std::ranges::find(varying, input->slot) != varying.end();
+  const auto changes = [&](ValueId id) { return varies[static_cast<std::size_t>(l.value(id).base)]; };
+  const auto is_slot = [&](ValueId id) { return l.base(id).placement == Value::Placement::slot; };
   for (Step* step : steps) {
-    const bool changes = std::any_of(step->reads.begin(), step->reads.end(),
-                                     [&](ValueId id) { return varies[static_cast<std::size_t>(l.value(id).base)]; });
-    const bool stores = std::any_of(step->writes.begin(), step->writes.end(),
-                                    [&](ValueId id) { return l.base(id).placement == Value::Placement::slot; });
-    step->invariant = !varying.empty() && !changes && !stores;
+    step->invariant =
+        !varying.empty() && std::ranges::none_of(step->reads, changes) && std::ranges::none_of(step->writes, is_slot);
     for (const ValueId id : step->writes) varies[static_cast<std::size_t>(id)] = !step->invariant;
   }
 }
@@ -72,7 +70,7 @@ std::size_t stage_of(const Lowering& l, const Step& step) {
 }
 
 void schedule(Lowering& l, std::vector<Step*> steps) {
-  std::stable_sort(steps.begin(), steps.end(), [](const Step* a, const Step* b) { return a->order < b->order; });
+  std::ranges::stable_sort(steps, {}, &Step::order);
   find_invariants(l, steps);
   l.n_prepare = schedule_part(l, steps, true, 0);
   l.n_phase = schedule_part(l, steps, false, l.n_prepare);

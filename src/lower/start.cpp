@@ -1,6 +1,5 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 #include <optional>
 
 #include "lower/lowering.h"
@@ -15,6 +14,13 @@ Shape permuted(const Shape& of_x, const op::Permute& permute) {
   Shape result;
   for (std::size_t i = 0; i < 4; ++i) result[i] = of_x[static_cast<std::size_t>(permute.order[i])];
   return result;
+}
+
+Shape repeated_strides(const Value& x) {
+  Shape stride = x.stride;
+  for (std::size_t i = 0; i < 4; ++i)
+    if (x.shape[i] == 1) stride[i] = 0;
+  return stride;
 }
 
 bool is_contiguous(const Shape& shape, const Shape& stride) {
@@ -81,69 +87,49 @@ std::optional<Shape> reshape_strides(const Value& value, const Shape& to) {
   return result;
 }
 
-Value own(const Node& node) {
-  Value value;
-  value.node = &node, value.base = node.id, value.type = node.type, value.shape = node.shape;
-  value.stride = contiguous_strides(node.shape);
-  value.size = dtype_size(node.type, count(node.shape));
-  return value;
-}
-
-Value view(const Node& node, const Value& of, const Shape& stride, std::int64_t offset) {
-  Value value = own(node);
-  value.base = of.base, value.stride = stride, value.offset = of.offset + offset, value.size = 0;
-  return value;
-}
-
 /// Makes a view if the node computes nothing, else a value of its own.
 struct MakeValue {
   const Lowering& l;
   const Node& node;
 
-  Value operator()(const op::Input& op) const { return in_slot(*op.slot); }
-  Value operator()(const op::Write& op) const { return in_slot(*op.slot); }
-  Value operator()(const op::Constant&) const {
-    Value value = own(node);
-    value.placement = Value::Placement::constant;
-    return value;
-  }
-  Value operator()(const op::Parameter&) const {
-    Value value = own(node);
-    value.placement = Value::Placement::parameter;
-    return value;
-  }
+  Value operator()(const op::Input& op) const { return own(Value::Placement::slot, op.slot); }
+  Value operator()(const op::Write& op) const { return own(Value::Placement::slot, op.slot); }
+  Value operator()(const op::Constant&) const { return own(Value::Placement::constant); }
+  Value operator()(const op::Parameter&) const { return own(Value::Placement::parameter); }
 
   Value operator()(const op::Slice& op) const {
-    return must_copy() ? own(node)
-                       : view(node, x(), x().stride, op.first * x().stride[static_cast<std::size_t>(op.dim)]);
+    return view(x().stride, op.first * x().stride[static_cast<std::size_t>(op.dim)]);
   }
-  Value operator()(const op::Repeat&) const {
-    Shape stride = x().stride;
-    for (std::size_t i = 0; i < 4; ++i)
-      if (x().shape[i] == 1) stride[i] = 0;
-    return must_copy() ? own(node) : view(node, x(), stride, 0);
-  }
+  Value operator()(const op::Repeat&) const { return view(repeated_strides(x())); }
+  Value operator()(const op::Permute& op) const { return view(permuted(x().stride, op)); }
   Value operator()(const op::Reshape&) const {
     const auto stride = reshape_strides(x(), node.shape);
-    return must_copy() || !stride ? own(node) : view(node, x(), *stride, 0);
-  }
-  Value operator()(const op::Permute& op) const {
-    return must_copy() ? own(node) : view(node, x(), permuted(x().stride, op), 0);
+    return stride ? view(*stride) : own();
   }
 
   /// All other nodes compute something.
   template <class Computes>
   Value operator()(const Computes&) const {
-    return own(node);
+    return own();
   }
 
  private:
   const Value& x() const { return l.value(node.in[0].node()->id); }
-  /// Whether a tapped view must be a copy: its slot may be overwritten later in the run.
-  bool must_copy() const { return node.tapped && l.base(x().base).placement == Value::Placement::slot; }
-  Value in_slot(const Slot& slot) const {
-    Value value = own(node);
-    value.placement = Value::Placement::slot, value.slot = &slot;
+  Value own(Value::Placement placement = Value::Placement::arena, const Slot* slot = nullptr) const {
+    return {.node = &node,
+            .type = node.type,
+            .shape = node.shape,
+            .stride = contiguous_strides(node.shape),
+            .base = node.id,
+            .placement = placement,
+            .size = dtype_size(node.type, count(node.shape)),
+            .slot = slot};
+  }
+  /// A view of x, or a copy if it is tapped and x's slot may be overwritten later in the run.
+  Value view(const Shape& stride, std::int64_t offset = 0) const {
+    Value value = own();
+    if (node.tapped && l.base(x().base).placement == Value::Placement::slot) return value;
+    value.base = x().base, value.stride = stride, value.offset = x().offset + offset, value.size = 0;
     return value;
   }
 };
@@ -151,15 +137,7 @@ struct MakeValue {
 }  // namespace
 
 void start(Lowering& l) {
-  const auto& nodes = l.graph.nodes();
-  l.needed = l.graph.needed();
-  l.fused.assign(nodes.size(), false);
-  l.readers.resize(nodes.size());
-  for (auto node = nodes.rbegin(); node != nodes.rend(); ++node) {
-    if (!l.needed[static_cast<std::size_t>(node->id)]) continue;
-    for (Tensor in : node->in) l.readers[static_cast<std::size_t>(in.node()->id)].push_back(&*node);
-  }
-  for (const Node& node : nodes) l.values.push_back(std::visit(MakeValue{l, node}, node.op));
+  for (const Node& node : l.graph.nodes()) l.values.push_back(std::visit(MakeValue{l, node}, node.op));
 }
 
 }  // namespace vla::lower

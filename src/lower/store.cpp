@@ -11,9 +11,8 @@ namespace {
 /// row-wise operation may read it itself, since it reads each element before it writes it.
 bool may_write(const Lowering& l, const std::vector<FusedOp>& ops, const Node& write, ValueId result) {
   const Slot* slot = l.value(write.id).slot;
-  const auto writer = std::find_if(ops.begin(), ops.end(), [&](const FusedOp& op) {
-    return std::find(op.writes.begin(), op.writes.end(), result) != op.writes.end();
-  });
+  const auto writer = std::ranges::find_if(
+      ops, [&](const FusedOp& op) { return std::ranges::find(op.writes, result) != op.writes.end(); });
   if (writer == ops.end()) return false;
   for (const FusedOp& op : ops)
     for (const ValueId id : op.reads) {

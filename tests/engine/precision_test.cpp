@@ -6,7 +6,7 @@
 
 #include <algorithm>
 
-#include "lower/cpu/precision.h"
+#include "lower/arithmetic.h"
 #include "policies/policy.h"
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"

@@ -4,7 +4,7 @@
 // Which operations become one. Whether fused operations compute the same is for ops_test.cpp and place_test.cpp.
 #include <sstream>
 
-#include "lower/cpu/precision.h"
+#include "lower/arithmetic.h"
 #include "lower_case.h"
 #include "support/kernel_rows.h"
 

@@ -17,7 +17,7 @@ constexpr std::int64_t kMinBlockRows = 128;
 /// it; 0 if x fits without blocks, or if the blocks would have too few rows.
 std::int64_t n_block_of(const CpuLowering& l, const Value& x, const kernels::LinearKernel& reader) {
   if (rounded(x) != kernels::RoundedLayout::tiles) return 0;
-  const std::int64_t d = kernels::round_up(x.shape[0], kernels::kTileSide), n_row = count(x.shape) / x.shape[0];
+  const std::int64_t d = kernels::round_up(x.shape[0], kernels::kTileSide), n_row = rows_of(x.shape);
   const std::int64_t max_rows = reader.l2_elements / d / kernels::kTileSide * kernels::kTileSide;
   if (max_rows < kMinBlockRows || n_row * d <= 2 * reader.l2_elements) return 0;
   const std::int64_t n_block = kernels::round_up(kernels::ceil_div(n_row, max_rows), l.n_thread);
@@ -38,8 +38,7 @@ void join(CpuLowering& l, CpuOp& up, CpuOp& down, std::int64_t n_block, std::vec
   l.value(inner).placement = Value::Placement::thread;
   CpuOp both;
   both.reads = up.reads, both.writes = down.writes, both.matrices = std::move(matrices), both.order = down.order;
-  std::copy_if(down.reads.begin(), down.reads.end(), std::back_inserter(both.reads),
-               [&](ValueId id) { return id != inner; });
+  std::ranges::copy_if(down.reads, std::back_inserter(both.reads), [&](ValueId id) { return id != inner; });
   BlockedOp blocked = {{}, n_block};
   blocked.products.push_back(std::move(up));
   blocked.products.push_back(std::move(down));

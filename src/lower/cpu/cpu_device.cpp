@@ -11,7 +11,6 @@
 #include "kernels/attention_kernel.h"
 #include "kernels/pages.h"
 #include "lower/cpu/cpu_program.h"
-#include "lower/cpu/precision.h"
 #include "lower/host/weight_plan.h"
 
 namespace vla::lower {
@@ -61,10 +60,8 @@ Status CpuDevice::load(const ParamList& params, bool fill, const WeightPlan& pla
 
 Result<WeightPlan> CpuDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
   const auto &first = static_cast<const CpuProgram&>(prefix), &then = static_cast<const CpuProgram&>(step);
-  const std::span<const std::vector<OpMatrices>> reads = first.reads();
-  return plan_streams({reads.first(first.n_prepare()), reads.subspan(first.n_prepare()), then.reads(),
-                       [&](const Param& matrix) { return weights_.size_of(matrix); }, weights_.size()},
-                      size);
+  const auto size_of = [&](const Param& matrix) { return weights_.size_of(matrix); };
+  return plan_streams({first.reads(), then.reads(), first.n_prepare(), size_of, weights_.size()}, size);
 }
 
 Status CpuDevice::allocate(Slots& slots) {

@@ -32,27 +32,10 @@ Result<std::unique_ptr<Program>> CpuProgram::make(CpuLowering& l, const Memory& 
 
 Status CpuProgram::give_addresses(CpuLowering& l) {
   VLA_TRY(own_, Memory::allocate(l.kept_size, "constants"));
-  const auto address = [&](const Value& value) -> std::byte* {
-    switch (value.placement) {
-      case Value::Placement::arena:
-        return arena_.data() + value.begin;
-      case Value::Placement::kept:
-      case Value::Placement::constant:
-        return own_.data() + value.begin;
-      case Value::Placement::slot:
-        return static_cast<std::byte*>(value.slot->place);
-      case Value::Placement::parameter:
-        return const_cast<std::byte*>(l.weights.data(value.node->as<op::Parameter>()->param));
-      case Value::Placement::thread:
-        break;
-    }
-    return nullptr;  // thread: scratch memory of each worker
-  };
-  for (std::size_t i = 0; i < l.values.size(); ++i) {
-    const Value& value = l.values[i];
-    l.data.push_back(value.base == static_cast<ValueId>(i) ? address(value) : nullptr);
-    if (value.placement == Value::Placement::constant) std::memcpy(l.data[i], constant_of(value), value.size);
-  }
+  l.data = addresses_of(l, arena_.data(), own_.data(), [&](const Param& param) { return l.weights.data(&param); });
+  for (std::size_t i = 0; i < l.values.size(); ++i)
+    if (l.values[i].placement == Value::Placement::constant)
+      std::memcpy(l.data[i], constant_of(l.values[i]), l.values[i].size);
   return {};
 }
 
@@ -67,7 +50,7 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
   std::vector<std::size_t> stage_end(stages.size(), 0);  // one past the last phase of each stage
   for (const CpuOp& op : l.ops) {
     const auto phase = static_cast<std::size_t>(op.phase);
-    CpuRun run = run_of(l, op);
+    CpuRun run = std::visit([&](const auto& what) { return run_of(l, op, what); }, op.op);
     scratch = std::max(scratch, run.scratch);
     const std::string text = text_of(l, op, run);
     uses_[phase].insert(uses_[phase].end(), run.matrices.begin(), run.matrices.end());
@@ -114,9 +97,6 @@ Status CpuProgram::cut(const CpuWeights& weights) {
   run_ = cut_phases(std::span(groups).subspan(n_prepare_), n_prepare_);
   return {};
 }
-
-Status CpuProgram::prepare() { return run(prepare_); }
-Status CpuProgram::run() { return run(run_); }
 
 /// Copies the matrices' current addresses from the table into the tasks.
 void CpuProgram::bind() const {

@@ -18,8 +18,8 @@ class CpuProgram final : public Program {
                                                std::shared_ptr<kernels::Executor> executor,
                                                std::shared_ptr<kernels::KindClock> clock);
 
-  Status prepare() override;
-  Status run() override;
+  Status prepare() override { return run(prepare_); }
+  Status run() override { return run(run_); }
   const std::vector<Stage>& stages() const override { return stages_; }
   std::vector<Work> work() const override { return work_; }
   /// Times one phase of each kind, predicts the run from these times and adds the time to read the weights from memory.

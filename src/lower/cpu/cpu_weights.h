@@ -43,7 +43,7 @@ class CpuWeights {
   /// opened; unsupported if no matrix is large enough to round (graph/rounding.h).
   static Result<CpuWeights> load(const ParamList& list, const Options& options, const WeightPlan& plan);
 
-  const std::byte* data(const Param* param) const { return table_->at(param).data; }
+  std::byte* data(const Param* param) const { return table_->at(param).data; }
   const float* floats(const Param* vector) const { return reinterpret_cast<const float*>(data(vector)); }
   /// The encoding of a parameter in memory.
   const Encoding& encoding(const Param* param) const { return place(param).encoding; }

@@ -16,23 +16,6 @@ constexpr double kMinSharedFlop = 2e6;
 /// Elements per item of an operation that is not a product.
 constexpr std::int64_t kItemElements = 16384;
 
-template <class Op>
-std::string lines_of(const CpuLowering& l, const CpuOp& op, const CpuRun& run, const Op& what) {
-  return line_of(l, op, run.kernel, what.text(), work_of(l, op));
-}
-/// Prints one line for each product of a block.
-std::string lines_of(const CpuLowering& l, const CpuOp& op, const CpuRun&, const BlockedOp& blocked) {
-  std::string lines;
-  for (CpuOp product : blocked.products) {
-    const auto& linear = std::get<LinearOp>(product.op);
-    product.phase = op.phase;
-    const char* kernel = kernel_of(l, *linear.linears[0]).name;
-    lines += fmt::format("{}{}, {} blocks of rows", lines.empty() ? "" : "\n",
-                         line_of(l, product, kernel, linear.text(), work_of(l, product)), blocked.n_block);
-  }
-  return lines;
-}
-
 }  // namespace
 
 RowItems::RowItems(const CpuLowering& l, std::int64_t n, std::int64_t d) : n_row(n) {
@@ -60,12 +43,19 @@ kernels::Window window_of(const Shape& x, const op::Window& window, const Shape&
 
 int threads_for(const CpuLowering& l, double flop) { return flop < kMinSharedFlop ? 1 : l.n_thread; }
 
-CpuRun run_of(const CpuLowering& l, const CpuOp& op) {
-  return std::visit([&](const auto& what) { return run_of(l, op, what); }, op.op);
-}
-
 std::string text_of(const CpuLowering& l, const CpuOp& op, const CpuRun& run) {
-  return std::visit([&](const auto& what) { return lines_of(l, op, run, what); }, op.op);
+  const std::string what = std::visit([](const auto& of) { return of.text(); }, op.op);
+  const auto* blocked = std::get_if<BlockedOp>(&op.op);
+  if (blocked == nullptr) return line_of(l, op, run.kernel, what, work_of(l, op));
+  std::string lines;
+  for (CpuOp product : blocked->products) {
+    const auto& linear = std::get<LinearOp>(product.op);
+    product.phase = op.phase;
+    const char* kernel = kernel_of(l, *linear.linears[0]).name;
+    lines += fmt::format("{}{}, {} blocks of rows", lines.empty() ? "" : "\n",
+                         line_of(l, product, kernel, linear.text(), work_of(l, product)), blocked->n_block);
+  }
+  return lines;
 }
 
 /// Drops the numbers that identify one instance of an operation: the phase at the start of a line, a layer number after

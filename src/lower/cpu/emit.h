@@ -35,14 +35,13 @@ struct CpuRun {
   std::unique_ptr<Task> task;  // for the executor; all addresses are set except those of matrices
   MatrixUses matrices = {};    // matrices whose addresses are set before a run
 };
+/// Requires that every value has an address.
 #define VLA_RUN_OP(Op) CpuRun run_of(const CpuLowering& l, const CpuOp& op, const Op& what);
 VLA_LOWERED_OPS(VLA_RUN_OP)
 VLA_RUN_OP(PackOp)
 VLA_RUN_OP(BlockedOp)
 #undef VLA_RUN_OP
 
-/// Requires that every value has an address.
-CpuRun run_of(const CpuLowering& l, const CpuOp& op);
 /// FLOP and bytes of an operation.
 Work work_of(const CpuLowering& l, const CpuOp& op);
 /// Prints an operation: text, kernel, shapes and layouts.
@@ -63,7 +62,6 @@ struct RowItems {
   std::int64_t n_row, n_each, n_item;
 };
 
-inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]; }
 inline std::byte* address(const CpuLowering& l, ValueId id) {
   return l.address(l.value(id).base) + dtype_size(l.value(id).type, l.value(id).offset);
 }
@@ -72,6 +70,9 @@ inline float* floats(const CpuLowering& l, ValueId id) {
   return id != kNone ? reinterpret_cast<float*>(address(l, id)) : nullptr;
 }
 inline const kernels::CpuKernels& cpu(const CpuLowering& l) { return *kernels::cpu_kernels(l.use); }
+inline const kernels::AttentionKernel& attention_kernel(const CpuLowering& l, bool rounds) {
+  return kernels::cpu_kernels(l.features(rounds))->attention;
+}
 inline kernels::RowKernel norm_kernel(const CpuLowering& l, const op::Norm& norm) {
   return norm.kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm;
 }

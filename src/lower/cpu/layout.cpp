@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <map>
 
-#include "kernels/cpu_kernels.h"
 #include "kernels/quantized.h"
 #include "lower/cpu/emit.h"
 #include "lower/layout.h"
@@ -11,9 +10,9 @@
 namespace vla::lower {
 namespace {
 
-class CpuLayouts final : Layouts {
+class CpuLayouts final : Layouts<CpuLowering> {
  public:
-  explicit CpuLayouts(CpuLowering& lowering) : Layouts(lowering), l(lowering) {}
+  explicit CpuLayouts(CpuLowering& lowering) : Layouts(lowering) {}
 
   void run(std::vector<FusedOp> ops) {
     for (FusedOp& op : ops) {
@@ -30,9 +29,6 @@ class CpuLayouts final : Layouts {
   }
 
  private:
-  void add(Step step, CopyOp copy) override { l.ops.push_back({std::move(step), std::move(copy)}); }
-  void add(Step step, RoundOp round) override { l.ops.push_back({std::move(step), std::move(round)}); }
-
   template <class Op>
   void choose(Step& step, Op& op) {
     meet(step, op.operands());
@@ -41,13 +37,13 @@ class CpuLayouts final : Layouts {
     if (kernel_of(l, *op.linears[0]).quantize != nullptr) {
       const Shape x = l.value(op.x).shape;
       round(step, op, DType::i8, kernels::quantized_stride(x[0]), "quantize");
-      l.value(op.x).size = static_cast<std::size_t>(kernels::quantized_size(count(x) / x[0], x[0]));
+      l.value(op.x).size = static_cast<std::size_t>(kernels::quantized_size(rows_of(x), x[0]));
     }
     meet(step, op.operands());
   }
   void choose(Step& step, PackOp& op) {
     meet(step, op.operands());
-    l.value(step.writes[0]).size = attention(op.rounds).packed_size(pack_sizes(l, op));
+    l.value(step.writes[0]).size = attention_kernel(l, op.rounds).packed_size(pack_sizes(l, op));
   }
 
   void round_result(const CpuOp& op, const LinearOp& linear) {
@@ -57,11 +53,7 @@ class CpuLayouts final : Layouts {
   }
   void round_result(const CpuOp& op, const AttentionOp& node) {
     if (l.value(op.writes[0]).shape[0] % kernels::kTileSide == 0)
-      round_result(op.writes[0], attention(node.rounds).rounded);
-  }
-
-  const kernels::AttentionKernel& attention(bool rounds) const {
-    return kernels::cpu_kernels(l.features(rounds))->attention;
+      round_result(op.writes[0], attention_kernel(l, node.rounds).rounded);
   }
 
   /// Stores a value rounded if only products and attention read it, which would round it anyway.
@@ -76,7 +68,7 @@ class CpuLayouts final : Layouts {
       view->type = DType::bf16, view->layout = static_cast<int>(layout);
       if (layout == kernels::RoundedLayout::tiles) view->form = " tiles ";
     }
-    y.size = static_cast<std::size_t>(kernels::rounded_count(layout, count(y.shape) / y.shape[0], y.shape[0])) * 2;
+    y.size = static_cast<std::size_t>(kernels::rounded_count(layout, rows_of(y.shape), y.shape[0])) * 2;
   }
 
   /// Whether an operation can read a value, or a view of it, in a rounded layout: a product must read the whole value;
@@ -87,7 +79,7 @@ class CpuLayouts final : Layouts {
              id != linear->residual && id != linear->factor && kernel_of(l, *linear->linears[0]).rounded == layout;
     const auto takes_heads = [&](const HeadRows& rows, bool rounds) {
       const bool is_plain = id != rows.x || (rows.norm == nullptr && rows.rope == nullptr);
-      return is_plain && id != rows.table && attention(rounds).rounded == layout && lies_in_rows(id);
+      return is_plain && id != rows.table && attention_kernel(l, rounds).rounded == layout && lies_in_rows(id);
     };
     if (const auto* pack = std::get_if<PackOp>(&op.op)) return takes_heads(pack->k, pack->rounds);
     if (const auto* node = std::get_if<AttentionOp>(&op.op))
@@ -103,7 +95,6 @@ class CpuLayouts final : Layouts {
            x.offset % d + (x.shape[1] - 1) * x.stride[1] + x.shape[0] <= d;
   }
 
-  CpuLowering& l;
   // For each base: the operations that read it or a view of it, and the value with its views.
   std::map<ValueId, std::vector<std::pair<const CpuOp*, ValueId>>> reads_;
   std::map<ValueId, std::vector<Value*>> views_;
@@ -112,8 +103,7 @@ class CpuLayouts final : Layouts {
 }  // namespace
 
 const kernels::LinearKernel& kernel_of(const CpuLowering& l, const Node& linear) {
-  const Shape& x = linear.in[0].shape();
-  return l.weights.kernel(linear.as<op::Linear>()->weight)->for_batch(count(x) / x[0]);
+  return l.weights.kernel(linear.as<op::Linear>()->weight)->for_batch(rows_of(linear.in[0].shape()));
 }
 
 void choose_layouts(CpuLowering& l, std::vector<FusedOp> ops) { CpuLayouts(l).run(std::move(ops)); }

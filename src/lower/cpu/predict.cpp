@@ -35,7 +35,7 @@ std::vector<double> CpuProgram::seconds_of_kinds() const {
     if (kind == chosen.size()) chosen.push_back(i), n_met.push_back(0);
     if (++n_met[kind] == 2) chosen[kind] = i;
   }
-  std::sort(chosen.begin(), chosen.end());
+  std::ranges::sort(chosen);
   std::vector<Clock::time_point> ended(chosen.size());
   std::vector<kernels::Phase> phases;
   for (std::size_t i = 0; i < chosen.size(); ++i) phases.push_back({phases_[chosen[i]].tasks, &ended[i]});

@@ -27,7 +27,7 @@ Multiplier multiplier_of(const CudaWeight& weight) {
 Result<std::unique_ptr<Device>> CudaDevice::open(const cuda::Driver& driver, int index,
                                                  const std::vector<std::string>& modules, Rounding at_load) {
   VLA_TRY(std::shared_ptr<CudaQueue> queue, CudaQueue::open(driver, index, modules));
-  const std::string name = "cuda:" + std::to_string(index) + ", " + queue->device_name();
+  const std::string name = "cuda:" + std::to_string(index) + ", " + queue->gpu()->name();
   return std::unique_ptr<Device>(new CudaDevice(name, std::move(queue), at_load));
 }
 
@@ -53,10 +53,8 @@ Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan& pl
 
 Result<WeightPlan> CudaDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
   const auto &first = static_cast<const CudaProgram&>(prefix), &then = static_cast<const CudaProgram&>(step);
-  const std::span<const std::vector<OpMatrices>> reads = first.reads();
-  return plan_streams({reads.first(first.n_prepare()), reads.subspan(first.n_prepare()), then.reads(),
-                       [&](const Param& matrix) { return weights_.size_of(matrix); }, weights_.memory()->size()},
-                      size);
+  const auto size_of = [&](const Param& matrix) { return weights_.size_of(matrix); };
+  return plan_streams({first.reads(), then.reads(), first.n_prepare(), size_of, weights_.memory()->size()}, size);
 }
 
 Precision CudaDevice::precision() const {

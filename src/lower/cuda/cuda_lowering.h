@@ -3,14 +3,19 @@
 #pragma once
 
 #include <memory>
+#include <optional>
 
 #include "cuda/kernels/attention.h"
+#include "cuda/kernels/linear_bf16.h"
+#include "kernels/sizes.h"
 #include "lower/cuda/cuda_queue.h"
 #include "lower/cuda/cuda_weights.h"
 #include "lower/ops.h"
 
 /// A GPU's passes: copy operands that kernels need contiguous, and make the launches of each operation.
 namespace vla::lower {
+
+using kernels::ceil_div;
 
 /// Norms and rotates rows of heads for attention, and converts them to bf16 if attention reads that.
 struct HeadOp {
@@ -20,23 +25,12 @@ struct HeadOp {
   double flop() const { return 0; }
 };
 
-/// The blocks that a product is cut into. few: for few rows, bound by reading the matrix. strip16 to strip128: strips
-/// of that many columns and up to 64 rows. rows64, rows128: tiles of that many rows. hopper: a Hopper tile.
-enum class ProductShape { few, strip16, strip32, strip64, strip128, rows64, rows128, hopper };
-/// Columns of a strip; 0 for other shapes.
-constexpr std::int64_t strip_width(ProductShape shape) {
-  return shape == ProductShape::strip16    ? 16
-         : shape == ProductShape::strip32  ? 32
-         : shape == ProductShape::strip64  ? 64
-         : shape == ProductShape::strip128 ? 128
-                                           : 0;
-}
-/// A product's block shape and the number of shares that its depth is split into.
+/// A product's blocks, and the number of shares that its depth is split into.
 struct ProductCut {
-  ProductShape shape = ProductShape::few;
-  int n_split = 1;       // shares of the depth, each with its own blocks
-  std::size_t tile = 0;  // index into kHopperTiles or kHopperInt8Tiles
-  double us = 0;         // estimated time on Hopper
+  cuda::Bf16Shape shape = cuda::Bf16Shape::few;  // also of codes: few or rowsN; with a Hopper tile rows128
+  int n_split = 1;                               // shares of the depth, each with its own blocks
+  std::optional<std::size_t> tile = {};          // of Hopper: index into kHopperTiles or kHopperInt8Tiles
+  double us = 0;                                 // estimated time on Hopper
 };
 /// How attention is cut into blocks of query rows and shares of the keys.
 struct AttentionPlan {

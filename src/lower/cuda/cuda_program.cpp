@@ -6,7 +6,6 @@
 #include <cstring>
 
 #include "lower/cuda/emit.h"
-#include "lower/cuda/merge_calls.h"
 
 namespace vla::lower {
 Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_ptr<CudaQueue> queue,
@@ -33,24 +32,7 @@ Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
     std::memcpy(&constants[value.begin - first], constant_of(value), value.size);
   }
   if (!constants.empty()) VLA_CHECK(queue_->upload(own_->address() + first, constants.data(), constants.size()));
-  const auto address = [&](const Value& value) -> cuda::Address {
-    switch (value.placement) {
-      case Value::Placement::arena:
-        return arena.address() + value.begin;
-      case Value::Placement::kept:
-      case Value::Placement::constant:
-        return own_->address() + value.begin;
-      case Value::Placement::slot:
-        return reinterpret_cast<cuda::Address>(value.slot->place);
-      case Value::Placement::parameter:
-        return l.weights[*value.node->as<op::Parameter>()->param].data;
-      case Value::Placement::thread:
-        break;
-    }
-    return 0;
-  };
-  for (std::size_t i = 0; i < l.values.size(); ++i)
-    l.data.push_back(l.values[i].base == static_cast<ValueId>(i) ? address(l.values[i]) : 0);
+  l.data = addresses_of(l, arena.address(), own_->address(), [&](const Param& param) { return l.weights[param].data; });
   return {};
 }
 
@@ -78,9 +60,11 @@ Result<std::vector<int>> CudaProgram::make_parts(const CudaLowering& l) {
   std::vector<std::vector<Calls>> phases(static_cast<std::size_t>(l.n_phase));
   reads_.resize(phases.size());
   for (const CudaOp& op : l.ops) {
-    VLA_TRY(Calls calls, emit(l, op));
-    if (!op.invariant) work_[stage_of(l, op)] += work_of(l, op);
-    text_ += text_of(l, op, calls);
+    VLA_TRY(Calls calls, std::visit([&](const auto& what) { return calls_of(l, op, what); }, op.op));
+    const std::string text = std::visit([](const auto& what) { return what.text(); }, op.op);
+    const Work work = work_of(l, op);
+    if (!op.invariant) work_[stage_of(l, op)] += work;
+    text_ += line_of(l, op, calls.empty() ? "nothing" : calls.front().how.kernel, text, work) + "\n";
     n_launch.push_back(static_cast<int>(calls.size()));
     const auto phase = static_cast<std::size_t>(op.phase);
     phases[phase].push_back(std::move(calls));

@@ -13,8 +13,6 @@ namespace {
 constexpr std::size_t kStreams = 4;
 /// Most nodes of a graph; drivers run out of memory with more. A longer act takes several launches.
 constexpr std::size_t kMaxLaunches = 20000;
-/// Alignment of slots: a smaller gap between two uploads is padding, so one copy joins them.
-constexpr std::size_t kPadding = 256;
 /// Capacity after the images for the other uploads of an act: tokens, state and noise.
 constexpr std::size_t kRoom = std::size_t{256} << 10;
 
@@ -50,7 +48,7 @@ Result<std::shared_ptr<cuda::Buffer>> CudaQueue::allocate(std::size_t size, cons
   size = std::max<std::size_t>(size, 1);
   if (is_dry_) {
     const cuda::Address address = next_;
-    next_ += (size + kPadding - 1) / kPadding * kPadding;
+    next_ += device_aligned(size);
     return std::make_shared<cuda::Buffer>(nullptr, address, size);
   }
   VLA_CHECK(failure_);
@@ -101,25 +99,9 @@ Status CudaQueue::stage(cuda::Address to, const void* from, std::size_t size) {
     uploads_.push_back({to, static_cast<std::byte*>(const_cast<void*>(from)), size, std::move(block)});
     return {};
   }
-  std::size_t gap = kPadding;
-  if (!uploads_.empty()) {
-    const cuda::Address end = uploads_.back().to + uploads_.back().size;
-    if (to >= end && to - end < kPadding) gap = static_cast<std::size_t>(to - end);
-  }
-  if (gap < kPadding) {
-    Upload& last = uploads_.back();
-    const HostMemory& memory = last.block ? last.block->memory : staging_;
-    std::byte* end = last.from + last.size;
-    if (end + gap + size <= memory.at(memory.size)) {
-      std::memset(end, 0, gap);
-      std::memcpy(end + gap, from, size);
-      last.size += gap + size;
-      if (!last.block) n_staged_ += gap + size;
-      return {};
-    }
-  }
-  if (n_staged_ + size + kPadding > staging_.size) {  // grow until all inputs of an act fit
-    const std::size_t enough = 2 * (n_staged_ + size) + kPadding;
+  if (join(to, from, size)) return {};
+  if (n_staged_ + size + kDeviceAlignment > staging_.size) {  // grow until all inputs of an act fit
+    const std::size_t enough = 2 * (n_staged_ + size) + kDeviceAlignment;
     VLA_CHECK(start_uploads());
     VLA_CHECK(wait());
     VLA_CHECK(grow(staging_, enough));
@@ -128,6 +110,21 @@ Status CudaQueue::stage(cuda::Address to, const void* from, std::size_t size) {
   std::memcpy(staging_.at(n_staged_), from, size);
   n_staged_ += size;
   return {};
+}
+
+/// Adds bytes to the last copy, if they follow it but for the padding of a slot, and its memory has room for them.
+bool CudaQueue::join(cuda::Address to, const void* from, std::size_t size) {
+  if (uploads_.empty()) return false;
+  Upload& last = uploads_.back();
+  const HostMemory& memory = last.block ? last.block->memory : staging_;
+  std::byte* const end = last.from + last.size;
+  const std::size_t gap = to - (last.to + last.size);  // very large if they come before it
+  if (gap >= kDeviceAlignment || end + gap + size > memory.at(memory.size)) return false;
+  std::memset(end, 0, gap);
+  std::memcpy(end + gap, from, size);
+  last.size += gap + size;
+  if (!last.block) n_staged_ += gap + size;
+  return true;
 }
 
 std::shared_ptr<std::byte> CudaQueue::host_memory(std::size_t size) {
@@ -293,7 +290,7 @@ Status CudaQueue::capture(const CudaPart& part) {
 }
 
 void CudaQueue::forget(const CudaPart& part) {
-  const auto has = [&](const Parts& parts) { return std::find(parts.begin(), parts.end(), &part) != parts.end(); };
+  const auto has = [&](const Parts& parts) { return std::ranges::find(parts, &part) != parts.end(); };
   if (failure_ && (has(pending_) || has(launched_))) {
     static_cast<void>(keep(launch()));
     static_cast<void>(keep(wait()));

@@ -55,8 +55,6 @@ class CudaQueue {
   int n_sm() const { return n_sm_; }
   /// Whether the device runs Hopper kernels (sm_90a).
   bool is_hopper() const { return is_hopper_; }
-  /// The device's name, from the driver.
-  std::string device_name() const { return gpu_ ? gpu_->name() : ""; }
   const Status& failure() const { return failure_; }
   /// Dry: from now on nothing is allocated and writes are skipped.
   void set_dry(bool dry) { is_dry_ = dry; }
@@ -118,6 +116,7 @@ class CudaQueue {
 
   Status grow(HostMemory& memory, std::size_t size);
   Status stage(cuda::Address to, const void* from, std::size_t size);
+  bool join(cuda::Address to, const void* from, std::size_t size);
   Result<std::shared_ptr<HostBlock>> block_of(const void* from);
   Result<std::shared_ptr<HostBlock>> make_block(std::size_t size);
   Status copy(cuda::Address to, const CudaSent& sent, std::size_t size);

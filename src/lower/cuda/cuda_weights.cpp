@@ -3,6 +3,7 @@
 #include "lower/cuda/cuda_weights.h"
 
 #include <algorithm>
+#include <array>
 #include <cstring>
 #include <map>
 
@@ -59,6 +60,50 @@ MatrixPlace place_of(const Param& matrix, const CudaWeight& weight) {
   return place;
 }
 
+/// Copies groups of matrices into windows of device memory over a separate stream, while kernels read other windows.
+/// The host's windows are page-locked, so that the device reads them directly.
+class CudaWindows final : public WindowMemory {
+ public:
+  /// device: address of the first window; each has `size` bytes. Errors: device, out_of_memory.
+  static Result<std::unique_ptr<WindowMemory>> open(std::shared_ptr<CudaQueue> queue, cuda::Address device,
+                                                    std::size_t size) {
+    const std::shared_ptr<cuda::Gpu> gpu = queue->gpu();
+    VLA_CHECK(gpu->use());
+    VLA_TRY(cuda::Stream copies, gpu->stream());
+    std::unique_ptr<CudaWindows> windows(new CudaWindows(std::move(queue), std::move(copies), device, size));
+    for (cuda::Owned& event : windows->read_) {
+      VLA_TRY(event, gpu->event(false));
+    }
+    VLA_TRY(windows->host_, gpu->allocate_host(WeightStream::kWindows * size));
+    return std::unique_ptr<WindowMemory>(std::move(windows));
+  }
+  ~CudaWindows() override { static_cast<void>(queue_->gpu()->use()); }
+
+  std::byte* host(int window) override { return static_cast<std::byte*>(host_.get()) + offset(window); }
+  Status note_read(int window) override { return queue_->keep(queue_->record(read(window))); }
+  Status upload(int window, std::size_t size) override { return queue_->keep(copy(window, size)); }
+
+ private:
+  CudaWindows(std::shared_ptr<CudaQueue> queue, cuda::Stream copies, cuda::Address device, std::size_t size)
+      : queue_(std::move(queue)), copies_(std::move(copies)), device_(device), size_(size) {}
+  std::size_t offset(int window) const { return static_cast<std::size_t>(window) * size_; }
+  /// The event recorded after the kernels that have read a window so far.
+  const cuda::Owned& read(int window) const { return read_[static_cast<std::size_t>(window)]; }
+  Status copy(int window, std::size_t size) {
+    VLA_CHECK(queue_->gpu()->use());
+    VLA_CHECK(copies_.after(read(window)));
+    VLA_CHECK(copies_.upload(device_ + offset(window), host(window), size));
+    return copies_.wait();
+  }
+
+  std::shared_ptr<CudaQueue> queue_;
+  cuda::Stream copies_;
+  cuda::Address device_;
+  std::size_t size_;
+  cuda::Owned host_;
+  std::array<cuda::Owned, WeightStream::kWindows> read_;
+};
+
 }  // namespace
 
 std::string kernel_name(MatrixKind kind) {
@@ -66,13 +111,9 @@ std::string kernel_name(MatrixKind kind) {
   return std::string("linear_") + kNames[static_cast<int>(kind)];
 }
 
-bool CudaWeights::has(MatrixKind kind) const {
-  return std::any_of(all_.begin(), all_.end(), [&](const CudaWeight& weight) { return weight.kind == kind; });
-}
+bool CudaWeights::has(MatrixKind kind) const { return std::ranges::find(all_, kind, &CudaWeight::kind) != all_.end(); }
 
-bool CudaWeights::has_codes() const {
-  return std::any_of(all_.begin(), all_.end(), [](const CudaWeight& weight) { return is_of_codes(weight.kind); });
-}
+bool CudaWeights::has_codes() const { return std::ranges::any_of(all_, is_of_codes, &CudaWeight::kind); }
 
 std::size_t CudaWeights::size_of(const Param& matrix) const {
   return device_aligned(place_of(matrix, (*this)[matrix]).size_of(matrix));

@@ -8,7 +8,8 @@
 
 #include "cuda/kernels/linear_int8.h"
 #include "graph/rounding.h"
-#include "lower/cuda/cuda_windows.h"
+#include "lower/cuda/cuda_queue.h"
+#include "lower/host/device_windows.h"
 
 namespace vla::lower {
 

@@ -18,15 +18,6 @@ Error unsupported(const char* what, const char* more, std::int64_t most, std::in
   return {Code::unsupported, what, more + (" " + std::to_string(most)), std::to_string(found), "use --kernels ggml"};
 }
 
-Result<Calls> emit(const CudaLowering& l, const CudaOp& op) {
-  return std::visit([&](const auto& what) { return calls_of(l, op, what); }, op.op);
-}
-
-std::string text_of(const CudaLowering& l, const CudaOp& op, const Calls& calls) {
-  const std::string what = std::visit([](const auto& of) { return of.text(); }, op.op);
-  return line_of(l, op, calls.empty() ? "nothing" : calls.front().how.kernel, what, work_of(l, op)) + "\n";
-}
-
 Work work_of(const CudaLowering& l, const CudaOp& op) {
   Work work;
   work.flop = std::visit([](const auto& what) { return what.flop(); }, op.op);

@@ -17,9 +17,9 @@ VLA_LOWERED_OPS(VLA_CALLS_OF_OP)
 VLA_CALLS_OF_OP(HeadOp)
 #undef VLA_CALLS_OF_OP
 
-Result<Calls> emit(const CudaLowering& l, const CudaOp& op);
-/// The operation's line of Program::text.
-std::string text_of(const CudaLowering& l, const CudaOp& op, const Calls& calls);
+/// Merges independent operations of a phase, such as those of q, k and v, into one kernel: products in strips or Hopper
+/// tiles with equal rows, depth and shares, and operations on rows of heads. n_sm: SMs of the device.
+void merge_calls(std::vector<Calls>& phase, int n_sm);
 
 // Shared by the files of lower/cuda/ops.
 
@@ -29,7 +29,6 @@ Call call(const cuda::Launch& how, const Job& job) {
   return {how, {bytes, bytes + sizeof(job)}};
 }
 inline int narrow(std::int64_t n) { return static_cast<int>(n); }
-inline std::int64_t rows_of(const Shape& shape) { return count(shape) / shape[0]; }
 /// `more` precedes the limit `most` in the message, such as "heads of at most".
 Error unsupported(const char* what, const char* more, std::int64_t most, std::int64_t found);
 

@@ -106,9 +106,7 @@ constexpr Loop kLoops[] = {
     {"attention_bf16_256_32", 661, 64, 123, 64, 64 * (2 * 256 + 16), 2, 8},
 };
 
-const Loop& loop_of(const std::string& kernel) {
-  return *std::find_if(std::begin(kLoops), std::end(kLoops), [&](const Loop& loop) { return kernel == loop.kernel; });
-}
+const Loop& loop_of(const std::string& kernel) { return *std::ranges::find(kLoops, kernel, &Loop::kernel); }
 
 /// The cost of an operation on a GPU.
 struct Cost {
@@ -165,8 +163,8 @@ class Costs {
       const MatrixKind kind = l.matrix(*node).kind;
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
       const auto [shape, n_split, tile, us] = op.cut;
-      const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
-      const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
+      const std::int64_t size = shape == cuda::Bf16Shape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
+      const double tiles = static_cast<double>(ceil_div(columns, size) * ceil_div(rows, size));
       if (kind == MatrixKind::f32) {  // padded rows and columns are multiplied, too
         const double padded = tiles * static_cast<double>(size * size) * 2 * static_cast<double>(weight.shape[0]);
         add_blocks(cost, tiles, padded / tiles / (gpu.f32 / gpu.n_sm));
@@ -174,10 +172,10 @@ class Costs {
         const bool is_one = linear.gated && op.gate == kNone;  // `us` is the time of gate and up together
         add_measured(cost, us / (is_one ? 2 : 1));
       } else if (const std::int64_t width = strip_width(shape); width > 0) {
-        const std::int64_t n_block = (columns + width - 1) / width * ((rows + 63) / 64) * n_split;
+        const std::int64_t n_block = ceil_div(columns, width) * ceil_div(rows, 64) * n_split;
         const std::int64_t bytes = (std::min<std::int64_t>(rows, 64) + width) * weight.shape[0] * 2 / n_split;
         add_blocks(cost, static_cast<double>(n_block), static_cast<double>(bytes) / (kSmBytes * gpu.clock));
-      } else if (shape == ProductShape::few) {
+      } else if (shape == cuda::Bf16Shape::few) {
         add_blocks(cost, gpu.n_sm, flop_of(*node) / (is_of_codes(kind) ? gpu.dot4 : gpu.f32));
       } else {
         const Loop& loop = loop_of(kernel_name(kind) + (size == 128 ? "_128" : "_64"));
@@ -189,18 +187,18 @@ class Costs {
   }
   void add_attention(Cost& cost, const CudaOp& op, const AttentionOp& attention) const {
     const Shape& q = l.value(attention.q.x).shape;
+    const AttentionPlan& plan = op.plan;
     if (!attention.rounds) {
-      const double n_block = static_cast<double>((q[2] + 7) / 8 * q[1] * q[3]) * op.plan.n_split;
+      const double n_block = static_cast<double>(ceil_div(q[2], 8) * q[1] * q[3]) * plan.n_split;
       return add_blocks(cost, n_block, flop_of(*attention.node) / n_block / (gpu.f32 / gpu.n_sm));
     }
-    const AttentionPlan& plan = op.plan;
     if (gpu.is_hopper) return add_measured(cost, plan.us);
     const Loop& loop = loop_of(plan.shape->kernel);
     // Two multiply-adds per query, key and element of a head: scores and weighted values.
     const double n_key = flop_of(*attention.node) / (4.0 * static_cast<double>(count(q)));
     const std::int64_t n_head_kv = l.value(attention.packed[0]).shape[1], n_row = q[1] / n_head_kv * q[2];
-    const std::int64_t n_block = (n_row + plan.shape->rows - 1) / plan.shape->rows * n_head_kv * q[3] * op.plan.n_split;
-    add_loops(cost, static_cast<double>(n_block), std::ceil(n_key / loop.step / op.plan.n_split), loop, gpu.bf16,
+    const std::int64_t n_block = ceil_div(n_row, plan.shape->rows) * n_head_kv * q[3] * plan.n_split;
+    add_loops(cost, static_cast<double>(n_block), std::ceil(n_key / loop.step / plan.n_split), loop, gpu.bf16,
               2 * 16 * 8 * 16);
   }
 

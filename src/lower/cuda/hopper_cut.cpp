@@ -76,21 +76,19 @@ std::vector<Candidate> candidates(MatrixKind kind, HopperCutFor what) {
   return all;
 }
 
-std::int64_t ceil_of(std::int64_t n, std::int64_t size) { return (n + size - 1) / size; }
-
 }  // namespace
 
 ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
                           HopperCutFor what, int n_sm) {
   const bool is_bf16 = kind == MatrixKind::bf16;
-  const std::int64_t n_step = ceil_of(depth, is_bf16 ? cuda::kHopperDepth : cuda::kHopperInt8Depth);
+  const std::int64_t n_step = ceil_div(depth, is_bf16 ? cuda::kHopperDepth : cuda::kHopperInt8Depth);
   const ProductRates& rates = is_bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
-  ProductCut best = {ProductShape::hopper, 1, 0, std::numeric_limits<double>::max()};
+  ProductCut best = {.shape = cuda::Bf16Shape::rows128, .us = std::numeric_limits<double>::max()};
   for (const Candidate& tile : candidates(kind, what))
     for (const int n_split : {1, 2, 3, 4, 6, 8}) {
       // The measured range: a share has at least 4 steps, or for codes 1 step with up to 4 shares. Products of codes
       // are not split further than about twice the SMs can use.
-      const std::int64_t n_whole = ceil_of(n_row, tile.rows) * ceil_of(n_column, tile.columns);
+      const std::int64_t n_whole = ceil_div(n_row, tile.rows) * ceil_div(n_column, tile.columns);
       if (n_split > 1 && n_step / n_split < (is_bf16 || n_split > 4 ? 4 : 1)) break;
       if (!is_bf16 && n_whole * (n_split - 1) > 2 * n_sm) break;
       const auto size = static_cast<double>(tile.columns * tile.rows);
@@ -98,10 +96,10 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
       const auto n_result = static_cast<double>(n_of_y * std::min(tile.rows, n_row));
       const double of_step =
           std::max({size / rates.sums, static_cast<double>(tile.step_bytes) / rates.of_sm, rates.least});
-      const double of_block = rates.block + static_cast<double>(ceil_of(n_step, n_split)) * of_step +
+      const double of_block = rates.block + static_cast<double>(ceil_div(n_step, n_split)) * of_step +
                               (n_split == 1 ? rates.first_end + rates.end * n_result : rates.share * size);
       const std::int64_t n_block = n_whole * n_split;
-      const auto n_wave = static_cast<double>(ceil_of(n_block, n_sm));
+      const auto n_wave = static_cast<double>(ceil_div(n_block, n_sm));
       double us = rates.kernel + of_block * (1 + rates.further * (n_wave - 1));
       if (n_split > 1) us += static_cast<double>(4 * n_row * n_column * (n_split + 1)) / kWritten;
       if (us < best.us) best.n_split = n_split, best.tile = tile.index, best.us = us;

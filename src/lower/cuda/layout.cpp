@@ -20,9 +20,9 @@ bool is_of_strips(std::int64_t n_row, std::int64_t depth) {
   return n_row > cuda::kBf16FewRows && n_row <= 64 && depth % 8 == 0;
 }
 
-class CudaLayouts final : Layouts {
+class CudaLayouts final : Layouts<CudaLowering> {
  public:
-  explicit CudaLayouts(CudaLowering& lowering) : Layouts(lowering), l(lowering) {}
+  explicit CudaLayouts(CudaLowering& lowering) : Layouts(lowering) {}
 
   void run(std::vector<FusedOp> ops) {
     for (FusedOp& op : ops) std::visit([&](auto& what) { choose(op, what); }, op.op);
@@ -41,8 +41,6 @@ class CudaLayouts final : Layouts {
   }
 
  private:
-  void add(Step step, CopyOp copy) override { l.ops.push_back({std::move(step), std::move(copy)}); }
-  void add(Step step, RoundOp round) override { l.ops.push_back({std::move(step), std::move(round)}); }
   ValueId add_rows(const Shape& shape, DType type = DType::f32) { return add_value(shape, type, shape[0]); }
 
   template <class Op>
@@ -72,12 +70,12 @@ class CudaLayouts final : Layouts {
   void choose(Step& step, LinearOp& op) {
     const MatrixKind kind = l.matrix(*op.linears[0]).kind;
     const Shape y = op.linears[0]->shape;
-    const std::int64_t depth = l.value(op.x).shape[0], n_row = count(y) / y[0];
+    const std::int64_t depth = l.value(op.x).shape[0], n_row = rows_of(y);
     const bool is_one = op.gated && multiplies_both(op, n_row);
     const ProductCut cut = cut_product(l, kind, n_row, is_one ? 2 * y[0] : y[0], depth, is_one);
     if (is_of_codes(kind))
       round(step, op, DType::i8, kernels::quantized_stride(depth), "round");
-    else if (kind == MatrixKind::bf16 && cut.shape != ProductShape::few)
+    else if (kind == MatrixKind::bf16 && cut.shape != cuda::Bf16Shape::few)
       round(step, op, DType::bf16, bf16_stride(depth), "round");
     else if (op.norm != nullptr)
       round(step, op, DType::f32, depth, "round");
@@ -94,7 +92,7 @@ class CudaLayouts final : Layouts {
   bool is_plain_product(const CudaOp& op) const {
     const auto* product = std::get_if<LinearOp>(&op.op);
     return product != nullptr && product->linears.size() == 1 && op.reads.size() == 1 &&
-           l.matrix(*product->linears[0]).kind == MatrixKind::bf16 && op.cut.shape != ProductShape::few;
+           l.matrix(*product->linears[0]).kind == MatrixKind::bf16 && op.cut.shape != cuda::Bf16Shape::few;
   }
   /// Gives the plain products of one x, such as q, k and v, the same cut, so that merge_calls makes one launch of them.
   /// Does nothing if separate launches are faster, or if `first` is not the first product of its x.
@@ -109,11 +107,10 @@ class CudaLayouts final : Layouts {
     for (const std::size_t i : all) n_column += columns_of(i), apart += l.ops[i].cut.us;
     const auto& product = std::get<LinearOp>(l.ops[first].op);
     const Shape& y = product.linears[0]->shape;
-    const std::int64_t n_row = count(y) / y[0], depth = l.value(product.x).shape[0];
+    const std::int64_t n_row = rows_of(y), depth = l.value(product.x).shape[0];
     ProductCut cut = cut_product(l, MatrixKind::bf16, n_row, n_column, depth, false);
-    if (cut.shape == ProductShape::hopper)
-      cut = cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::several, l.n_sm);
-    const bool is_one_launch = cut.shape == ProductShape::hopper || (strip_width(cut.shape) > 0 && cut.n_split == 1);
+    if (cut.tile) cut = cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::several, l.n_sm);
+    const bool is_one_launch = cut.tile || (strip_width(cut.shape) > 0 && cut.n_split == 1);
     if (!is_one_launch || cut.us >= apart) return;
     for (const std::size_t i : all) {
       l.ops[i].cut = cut;
@@ -122,14 +119,19 @@ class CudaLayouts final : Layouts {
   }
   /// Whether one block computes columns of both gate and up.
   bool multiplies_both(const LinearOp& op, std::int64_t n_row) const {
-    return std::all_of(op.linears.begin(), op.linears.end(), [&](const Node* node) {
-      return l.matrix(*node).kind == MatrixKind::bf16 &&
-             (is_of_strips(n_row, l.value(op.x).shape[0]) || (l.is_hopper && n_row > 64));
-    });
+    const bool has_kernel = is_of_strips(n_row, l.value(op.x).shape[0]) || (l.is_hopper && n_row > 64);
+    const auto is_bf16 = [&](const Node* node) { return l.matrix(*node).kind == MatrixKind::bf16; };
+    return has_kernel && std::ranges::all_of(op.linears, is_bf16);
   }
   /// Adds the value for partial results if there are several shares. n: floats per share.
   void split(CudaOp& op, int n_split, std::int64_t n) {
     if (n_split > 1) op.writes.push_back(op.partial = add_rows({n, n_split, 1, 1}));
+  }
+  /// The operation whose first result is this value, or null.
+  CudaOp* maker_of(ValueId id) {
+    const auto makes = [&](const CudaOp& op) { return !op.writes.empty() && op.writes[0] == id; };
+    const auto maker = std::ranges::find_if(l.ops, makes);
+    return maker != l.ops.end() ? &*maker : nullptr;
   }
   /// Stores the result of a product, attention or window rounded if `round` is its only reader.
   void round_at_once(CudaOp& round, const RoundOp& what) {
@@ -137,9 +139,8 @@ class CudaLayouts final : Layouts {
     const bool is_whole =
         x.base == what.x && x.placement == Value::Placement::arena && x.node != nullptr && !x.node->tapped;
     if (what.norm != nullptr || to.type != DType::bf16 || !is_whole || n_reader_[what.x] != 1) return;
-    const auto maker = std::find_if(l.ops.begin(), l.ops.end(),
-                                    [&](const CudaOp& op) { return !op.writes.empty() && op.writes[0] == what.x; });
-    if (maker == l.ops.end()) return;
+    CudaOp* const maker = maker_of(what.x);
+    if (maker == nullptr) return;
     const bool is_attention = std::holds_alternative<AttentionOp>(maker->op) && x.shape[0] % 8 == 0;
     const bool is_other = std::holds_alternative<LinearOp>(maker->op) || std::holds_alternative<WindowOp>(maker->op);
     if (!is_attention && !is_other) return;
@@ -156,10 +157,8 @@ class CudaLayouts final : Layouts {
     if (rows.norm != nullptr || rows.rope != nullptr || l.value(to).type != DType::bf16 || !is_whole ||
         n_reader_[x.base] != 1)
       return;
-    const auto maker = std::find_if(l.ops.begin(), l.ops.end(), [&](const CudaOp& op) {
-      return !op.writes.empty() && op.writes[0] == x.base && std::holds_alternative<LinearOp>(op.op);
-    });
-    if (maker == l.ops.end()) return;
+    CudaOp* const maker = maker_of(x.base);
+    if (maker == nullptr || !std::holds_alternative<LinearOp>(maker->op)) return;
     const Shape rows_of_product = l.value(x.base).shape;
     maker->writes[0] = add_rows(rows_of_product, DType::bf16);
     l.value(to).base = maker->writes[0];
@@ -171,17 +170,16 @@ class CudaLayouts final : Layouts {
     const Value& x = l.value(what.x);
     const bool is_whole = x.base == what.x && x.placement == Value::Placement::arena && !is_tapped(what.x);
     if (what.norm == nullptr || !is_whole || x.shape[0] > cuda::kMostFinished) return;
-    const auto maker =
-        std::find_if(l.ops.begin(), l.ops.end(), [&](const CudaOp& op) { return op.writes[0] == what.x; });
-    if (maker == l.ops.end() || !leaves_plain_shares(*maker)) return;
+    CudaOp* const maker = maker_of(what.x);
+    if (maker == nullptr || !leaves_plain_shares(*maker)) return;
     const auto reads_first = [&](const CudaOp& op) {
       return std::pair(op.order, &op) < std::pair(norm.order, static_cast<const CudaOp*>(&norm)) &&
-             std::any_of(op.reads.begin(), op.reads.end(), [&](ValueId id) { return l.value(id).base == what.x; });
+             std::ranges::any_of(op.reads, [&](ValueId id) { return l.value(id).base == what.x; });
     };
-    if (std::any_of(l.ops.begin(), l.ops.end(), reads_first)) return;
+    if (std::ranges::any_of(l.ops, reads_first)) return;
     norm.finishes = std::make_shared<const CudaOp>(*maker);
     maker->writes = {maker->partial};
-    std::replace(norm.reads.begin(), norm.reads.end(), what.x, maker->partial);
+    std::ranges::replace(norm.reads, what.x, maker->partial);
     const auto& product = std::get<LinearOp>(maker->op);
     for (const ValueId id : {product.factor, product.residual})
       if (id != kNone) norm.reads.push_back(id);
@@ -198,7 +196,7 @@ class CudaLayouts final : Layouts {
   }
   /// Whether a value or a view of it is tapped.
   bool is_tapped(ValueId base) const {
-    return std::any_of(l.values.begin(), l.values.end(), [&](const Value& value) {
+    return std::ranges::any_of(l.values, [&](const Value& value) {
       return value.base == base && value.node != nullptr && value.node->tapped;
     });
   }
@@ -215,13 +213,12 @@ class CudaLayouts final : Layouts {
     split(made, plan.n_split, (q[0] + 2) * q[1] * q[2] * q[3]);
   }
 
-  CudaLowering& l;
   std::map<ValueId, std::pair<ValueId, ValueId>> keys_;
   std::map<ValueId, int> n_reader_;  // readers of each base and its views
 };
 
 std::int64_t blocks_of(std::int64_t n_row, std::int64_t n_column, std::int64_t rows, std::int64_t columns) {
-  return (n_row + rows - 1) / rows * ((n_column + columns - 1) / columns);
+  return ceil_div(n_row, rows) * ceil_div(n_column, columns);
 }
 
 /// Estimated microseconds of a strip kernel, from measurements on an H200: a warp takes a fixed time per step of the
@@ -231,22 +228,21 @@ double strip_us(std::int64_t width, int n_split, std::int64_t n_row, std::int64_
   constexpr double kBegin = 2, kOfAll = 2.5e6, kFinish = 2;
   const std::int64_t n_block = blocks_of(n_row, n_column, 64, width) * n_split;
   const std::int64_t n_warp = width <= 32 ? 8 : 256 / width;  // warps that share the depth
-  const std::int64_t of_warp =
-      (depth + cuda::kBf16Depth * n_warp * n_split - 1) / (cuda::kBf16Depth * n_warp * n_split);
+  const std::int64_t of_warp = ceil_div(depth, cuda::kBf16Depth * n_warp * n_split);
   const double of_step = width == 16 ? 0.85 : 1.4;
-  const double us = kBegin + static_cast<double>((n_block + n_sm - 1) / n_sm * of_warp) * of_step;
+  const double us = kBegin + static_cast<double>(ceil_div(n_block, n_sm) * of_warp) * of_step;
   return n_split == 1 ? us : us + kFinish + static_cast<double>(2 * 4 * n_row * n_column * n_split) / kOfAll;
 }
 
 /// The strip width and number of shares with the shortest time.
 ProductCut cut_in_strips(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
-  ProductCut best = {ProductShape::strip16, 1, 0, std::numeric_limits<double>::max()};
-  for (const ProductShape shape :
-       {ProductShape::strip16, ProductShape::strip32, ProductShape::strip64, ProductShape::strip128})
+  using enum cuda::Bf16Shape;
+  ProductCut best = {.us = std::numeric_limits<double>::max()};
+  for (const cuda::Bf16Shape shape : {strip16, strip32, strip64, strip128})
     for (const int n_split : {1, 2, 4, 8}) {
       if (n_split > 1 && depth / n_split < 8 * cuda::kBf16Depth) break;
       const double us = strip_us(strip_width(shape), n_split, n_row, n_column, depth, n_sm);
-      if (us < best.us) best = {shape, n_split, 0, us};
+      if (us < best.us) best = {.shape = shape, .n_split = n_split, .us = us};
     }
   return best;
 }
@@ -276,17 +272,16 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
   }
   if (has_tiles) return cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
   const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
-  const ProductShape shape = is_few                          ? ProductShape::few
-                             : n_row > 64 && n_large >= n_sm ? ProductShape::rows128
-                                                             : ProductShape::rows64;
+  using enum cuda::Bf16Shape;
+  const cuda::Bf16Shape shape = is_few ? few : n_row > 64 && n_large >= n_sm ? rows128 : rows64;
   if (kind == MatrixKind::f32) return {shape, 1};
-  std::int64_t n_block = shape == ProductShape::rows128 ? n_large : blocks_of(n_row, n_column, 64, 64);
+  std::int64_t n_block = shape == rows128 ? n_large : blocks_of(n_row, n_column, 64, 64);
   if (is_few) n_block = blocks_of(1, n_column, 1, is_bf16 ? 8 : 128);
   // A share has at least `least` steps. The depth is split only if there are fewer blocks than SMs. Codes allow fewer
   // steps per share: their steps are twice as deep, and one kernel that adds many shares is faster than the epilogues
   // of a few blocks.
   const std::int64_t step = is_bf16 ? cuda::kBf16Depth : cuda::Int8Tile::kDepth, least = is_bf16 ? 8 : 3;
-  const std::int64_t most = std::max<std::int64_t>((depth + step - 1) / step / least, 1);
+  const std::int64_t most = std::max<std::int64_t>(ceil_div(depth, step) / least, 1);
   return {shape, static_cast<int>(std::clamp<std::int64_t>(n_sm / std::max<std::int64_t>(n_block, 1), 1, most))};
 }
 

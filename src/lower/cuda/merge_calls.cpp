@@ -1,14 +1,12 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cuda/merge_calls.h"
-
 #include <algorithm>
 #include <cstring>
 #include <string_view>
 
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/kernels/rows.h"
-#include "lower/cuda/cuda_lowering.h"
+#include "lower/cuda/emit.h"
 
 namespace vla::lower {
 namespace {
@@ -18,11 +16,6 @@ Job job_of(const Call& call) {
   Job job;
   std::memcpy(&job, call.job.data(), sizeof(job));
   return job;
-}
-template <class Job>
-Call call_of(const cuda::Launch& how, const Job& job) {
-  const auto* bytes = reinterpret_cast<const std::byte*>(&job);
-  return {how, {bytes, bytes + sizeof(job)}};
 }
 
 /// Whether an operation is a product of one matrix in strips, without split depth.
@@ -35,8 +28,8 @@ bool is_heads(const Calls& calls) { return calls.size() == 1 && calls[0].how.ker
 /// The Hopper tile of a bf16 product, if a kernel computes several products with this tile and no other operation adds
 /// the product's shares; else null.
 const cuda::HopperTile* tile_of(const Calls& calls) {
-  const auto* tile = std::find_if(std::begin(cuda::kHopperTiles), std::end(cuda::kHopperTiles),
-                                  [&](const auto& one) { return calls[0].how.kernel == std::string_view(one.kernel); });
+  const std::string_view kernel = calls[0].how.kernel;
+  const auto* tile = std::ranges::find(cuda::kHopperTiles, kernel, &cuda::HopperTile::kernel);
   if (tile == std::end(cuda::kHopperTiles) || tile->several == nullptr) return nullptr;
   return (job_of<cuda::LinearBf16Job>(calls[0]).n_split > 1) == (calls.size() == 2) ? tile : nullptr;
 }
@@ -76,24 +69,24 @@ void merge_calls(std::vector<Calls>& phase, int n_sm) {
     for (int i = 0; i < jobs.n; ++i) n_column += jobs.job[i].n_column;
     const unsigned width = common_width(jobs.job[0].n_row, n_column, jobs.job[0].depth, n_sm);
     const cuda::Launch how = cuda::linear_strips(width, jobs);
-    return Calls{call_of(how, jobs)};
+    return Calls{call(how, jobs)};
   });
   merge<cuda::LinearBf16Job>(
       phase, [](const Calls& calls) { return tile_of(calls) != nullptr; },
       [](const Calls& a, const Calls& b) { return tile_of(a) == tile_of(b) && are_alike(a, b); },
       [](const Calls& first, Products& jobs) {
         const cuda::Launch product = cuda::hopper_linears_bf16(*tile_of(first), jobs);
-        Calls calls = {call_of(product, jobs)};
+        Calls calls = {call(product, jobs)};
         if (jobs.job[0].n_split == 1) return calls;
         const cuda::Launch finish = cuda::finish_bf16_partials(jobs);
-        calls.push_back(call_of(finish, jobs));
+        calls.push_back(call(finish, jobs));
         return calls;
       });
   merge<cuda::HeadJob>(
       phase, is_heads, [](const Calls&, const Calls&) { return true; },
       [](const Calls&, cuda::Several<cuda::HeadJob>& jobs) {
         const cuda::Launch how = cuda::several_head_rows(jobs);
-        return Calls{call_of(how, jobs)};
+        return Calls{call(how, jobs)};
       });
 }
 

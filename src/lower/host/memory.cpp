@@ -19,19 +19,16 @@ Result<Memory> Memory::map(std::size_t size, const std::string& what, int protec
                  "free memory or use a smaller model"};
   memory.data_.reset(static_cast<std::byte*>(data), [size](std::byte* bytes) { munmap(bytes, size); });
   memory.size_ = size;
+  want_large_pages(data, size);
   return memory;
 }
 
 Result<Memory> Memory::allocate(std::size_t size, const std::string& what) {
-  VLA_TRY(Memory memory, map(size, what, PROT_READ | PROT_WRITE, 0));
-  if (size > 0) want_large_pages(memory.data(), size);
-  return memory;
+  return map(size, what, PROT_READ | PROT_WRITE, 0);
 }
 
 Result<Memory> Memory::reserve(std::size_t size, const std::string& what) {
-  VLA_TRY(Memory memory, map(size, what, PROT_READ, MAP_NORESERVE));
-  if (size > 0) want_large_pages(memory.data(), size);
-  return memory;
+  return map(size, what, PROT_READ, MAP_NORESERVE);
 }
 
 }  // namespace vla::lower

@@ -9,20 +9,6 @@
 namespace vla::lower {
 namespace {
 
-/// Returns a segment for each phase that reads groups. If the last segment holds these groups already, extends that
-/// segment instead, with the phases between.
-std::vector<Segment> find_readers(std::span<const Groups> phases, std::size_t begin) {
-  std::vector<Segment> readers;
-  for (std::size_t i = 0; i < phases.size(); ++i) {
-    if (!phases[i].any()) continue;
-    if (!readers.empty() && readers.back().groups.holds(phases[i]))
-      readers.back().end = begin + i + 1;
-    else
-      readers.push_back({begin + i, begin + i + 1, phases[i]});
-  }
-  return readers;
-}
-
 /// The last group to release after a segment that reads `now`, if the next one reads `then`; -1: none.
 int released(const Groups& now, const Groups& then) {
   const bool goes_on = now.first <= then.first && then.first <= now.last;
@@ -51,16 +37,22 @@ Result<std::vector<Groups>> find_groups(const MatrixReads& phases, const std::ve
 }
 
 std::vector<Segment> cut_phases(std::span<const Groups> phases, std::size_t begin) {
-  std::vector<Segment> segments;
-  const std::vector<Segment> readers = find_readers(phases, begin);
-  std::size_t next = begin;
-  for (std::size_t i = 0; i < readers.size(); ++i) {
-    if (readers[i].begin > next) segments.push_back({next, readers[i].begin});
-    segments.push_back(readers[i]);
-    segments.back().released = released(readers[i].groups, i + 1 < readers.size() ? readers[i + 1].groups : Groups());
-    next = readers[i].end;
+  std::vector<Segment> segments;  // in the loop the last one reads groups
+  const auto go_to = [&](std::size_t next, const Groups& then) {
+    const std::size_t end = segments.empty() ? begin : segments.back().end;
+    if (!segments.empty()) segments.back().released = released(segments.back().groups, then);
+    if (end < next) segments.push_back({end, next});  // phases that read none
+  };
+  for (std::size_t i = 0; i < phases.size(); ++i) {
+    if (!phases[i].any()) continue;
+    // A phase whose groups the last segment holds extends it, with the phases between.
+    if (segments.empty() || !segments.back().groups.holds(phases[i])) {
+      go_to(begin + i, phases[i]);
+      segments.push_back({begin + i, begin + i, phases[i]});
+    }
+    segments.back().end = begin + i + 1;
   }
-  if (next < begin + phases.size()) segments.push_back({next, begin + phases.size()});
+  go_to(begin + phases.size(), {});
   return segments;
 }
 

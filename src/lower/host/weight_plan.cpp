@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <map>
 #include <set>
+#include <span>
 
 #include "lower/host/weight_stream.h"
 
@@ -44,7 +45,7 @@ class Planner {
     std::vector<Group> phases;
     std::set<const Param*> seen = resident_;
     window_ = 0;
-    for (const auto& ops : use_.prefix) {
+    for (const auto& ops : std::span(use_.prefix).subspan(use_.n_prepare)) {
       Group& phase = phases.emplace_back();
       for (const OpMatrices& op : ops)
         for (const Param* matrix : op)
@@ -59,10 +60,9 @@ class Planner {
       for (const Param* matrix : phase) group_of[matrix] = groups_.size() - 1;
     }
     const std::size_t n_resident = resident_.size();
-    for (const auto& part : {use_.prepare, use_.prefix})
-      for (const auto& ops : part)
-        for (const OpMatrices& op : ops)
-          if (reads_several(op, group_of)) resident_.insert(op.begin(), op.end());
+    for (const auto& ops : use_.prefix)
+      for (const OpMatrices& op : ops)
+        if (reads_several(op, group_of)) resident_.insert(op.begin(), op.end());
     return resident_.size() == n_resident;
   }
 

@@ -3,7 +3,6 @@
 #pragma once
 
 #include <functional>
-#include <span>
 
 #include "graph/device.h"
 
@@ -16,9 +15,10 @@ using MatrixReads = std::vector<std::vector<OpMatrices>>;
 
 /// The matrices that an act reads, and their size in the device's memory.
 struct WeightUse {
-  std::span<const std::vector<OpMatrices>> prepare, prefix, step;  // by phase; prepare: prefix phases that run once
-  std::function<std::size_t(const Param&)> size_of;                // bytes of a matrix
-  std::size_t size;                                                // bytes of all parameters
+  const MatrixReads &prefix, &step;
+  std::size_t n_prepare;                             // phases of the prefix that run once
+  std::function<std::size_t(const Param&)> size_of;  // bytes of a matrix
+  std::size_t size;                                  // bytes of all parameters
 };
 
 /// Plans which matrices to stream, so that all parameters take at most `size` bytes, or as few as possible. The step's

@@ -65,10 +65,7 @@ CopyOp lowered(const Lowering& l, const Node& node, const op::Slice& slice) {
 }
 
 CopyOp lowered(const Lowering& l, const Node& node, const op::Repeat&) {
-  const Value& x = l.value(operand(node, 0));
-  Shape from = x.stride;
-  for (std::size_t i = 0; i < 4; ++i)
-    if (x.shape[i] == 1) from[i] = 0;
+  const Shape from = repeated_strides(l.value(operand(node, 0)));
   return {&node, {{operand(node, 0), node.shape, from, contiguous_strides(node.shape)}}};
 }
 

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <type_traits>
+
 #include "lower/lowering.h"
 
 namespace vla::lower {
@@ -18,16 +20,11 @@ struct WindowOp {
   double flop() const { return 0; }
 };
 
-inline WindowOp lowered(const Lowering&, const Node& node, const op::Unfold& op) {
-  return {.node = &node, .window = op.window, .takes_largest = false, .x = operand(node, 0)};
-}
-inline WindowOp lowered(const Lowering&, const Node& node, const op::MaxPool& op) {
-  return {.node = &node, .window = op.window, .takes_largest = true, .x = operand(node, 0)};
-}
-inline WindowOp lowered(const Lowering&, const Node& node, const op::Depthwise& op) {
+template <class Op, class = decltype(Op::window)>
+WindowOp lowered(const Lowering&, const Node& node, const Op& op) {
   return {.node = &node,
           .window = op.window,
-          .takes_largest = false,
+          .takes_largest = std::is_same_v<Op, op::MaxPool>,
           .x = operand(node, 0),
           .weight = operand(node, 1),
           .bias = operand(node, 2)};

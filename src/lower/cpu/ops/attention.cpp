@@ -7,10 +7,6 @@
 namespace vla::lower {
 namespace {
 
-const kernels::AttentionKernel& attention_kernel(const CpuLowering& l, bool rounds) {
-  return kernels::cpu_kernels(l.features(rounds))->attention;
-}
-
 kernels::RowPrep prep_of(const CpuLowering& l, const HeadRows& rows) {
   kernels::RowPrep prep;
   if (rows.norm != nullptr) {

@@ -4,11 +4,6 @@
 #include "lower/cpu/emit.h"
 
 namespace vla::lower {
-double BlockedOp::flop() const {
-  double all = 0;
-  for (const CpuOp& product : products) all += std::get<LinearOp>(product.op).flop();
-  return all;
-}
 
 CpuRun run_of(const CpuLowering& l, const CpuOp&, const BlockedOp& blocked) {
   auto task = std::make_unique<kernels::BlockedTask>();

@@ -42,7 +42,7 @@ struct SetRowKernel {
 
  private:
   void broadcast(kernels::RowKernel of_rows, kernels::RowKernel of_scalars) const {
-    for (std::size_t i = 1; i < 4; ++i) row.w_stride[i] = w->shape[i] == 1 ? 0 : w->stride[i];
+    row.w_stride = repeated_strides(*w);
     row.w_is_scalar = w->shape[0] == 1 && row.shape[0] != 1;
     row.kernel = row.w_is_scalar ? of_scalars : of_rows;
   }

@@ -9,30 +9,10 @@
 namespace vla::lower {
 namespace {
 
-cuda::Bf16Shape bf16_shape(ProductShape shape) {
-  switch (shape) {
-    case ProductShape::few:
-      return cuda::Bf16Shape::few;
-    case ProductShape::strip16:
-      return cuda::Bf16Shape::strip16;
-    case ProductShape::strip32:
-      return cuda::Bf16Shape::strip32;
-    case ProductShape::strip64:
-      return cuda::Bf16Shape::strip64;
-    case ProductShape::strip128:
-      return cuda::Bf16Shape::strip128;
-    case ProductShape::rows64:
-      return cuda::Bf16Shape::rows64;
-    case ProductShape::rows128:
-    case ProductShape::hopper:
-      break;
-  }
-  return cuda::Bf16Shape::rows128;
-}
-cuda::Int8Shape int8_shape(ProductShape shape) {
-  return shape == ProductShape::few      ? cuda::Int8Shape::few
-         : shape == ProductShape::rows64 ? cuda::Int8Shape::rows64
-                                         : cuda::Int8Shape::rows128;
+cuda::Int8Shape int8_shape(cuda::Bf16Shape shape) {
+  return shape == cuda::Bf16Shape::few      ? cuda::Int8Shape::few
+         : shape == cuda::Bf16Shape::rows64 ? cuda::Int8Shape::rows64
+                                            : cuda::Int8Shape::rows128;
 }
 
 /// gate: the gate product, if the same kernel computes it with this one; else null.
@@ -66,9 +46,8 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .end = end,
                                        .gate_weight = gate ? l.param<std::uint16_t>(gate->weight) : nullptr,
                                        .gate_bias = gate ? l.param(gate->bias) : nullptr};
-      calls.push_back(call(shape == ProductShape::hopper ? cuda::hopper_linear_bf16(cuda::kHopperTiles[tile], job)
-                                                         : cuda::linear_bf16(bf16_shape(shape), job),
-                           job));
+      calls.push_back(
+          call(tile ? cuda::hopper_linear_bf16(cuda::kHopperTiles[*tile], job) : cuda::linear_bf16(shape, job), job));
       if (job.n_split > 1 && !leaves_shares(op)) calls.push_back(call(cuda::finish_bf16_partial(job), job));
       return;
     }
@@ -85,9 +64,8 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .n_split = n_split,
                                        .partial = l.at<int>(op.partial),
                                        .end = end};
-      calls.push_back(call(shape == ProductShape::hopper
-                               ? cuda::hopper_linear_int8(cuda::kHopperInt8Tiles[tile], job)
-                               : cuda::linear_int8(code_kind(matrix.kind), int8_shape(shape), job),
+      calls.push_back(call(tile ? cuda::hopper_linear_int8(cuda::kHopperInt8Tiles[*tile], job)
+                                : cuda::linear_int8(code_kind(matrix.kind), int8_shape(shape), job),
                            job));
       if (job.n_split > 1) calls.push_back(call(cuda::finish_int8_partial(job), job));
       return;

@@ -31,9 +31,8 @@ struct RowLaunch {
  private:
   Result<Calls> with_other(cuda::MapOperation operation) const {
     cuda::MapJob job = map();
-    const Value& w = l.value(row.w);
     job.operation = operation, job.b = l.at(row.w);
-    for (std::size_t i = 0; i < 4; ++i) job.b_step[i] = w.shape[i] == 1 ? 0 : w.stride[i];
+    std::ranges::copy(repeated_strides(l.value(row.w)), job.b_step);
     return Calls{call(cuda::map_elements(job), job)};
   }
   cuda::MapJob map() const {
