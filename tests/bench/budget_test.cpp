@@ -99,7 +99,8 @@ bool tries_all() { return std::getenv("VLA_ALL_BUDGETS") != nullptr; }
 /// What matrices are rounded to, and with VLA_ALL_BUDGETS all that multiplies them on this machine.
 std::vector<std::string> some_kernels() {
   if (!tries_all()) return {"", "portable", "int8", "int4"};
-  std::vector<std::string> names = {"", "float32", "bf16", "int8", "int4"};
+  std::vector<std::string> names = {"", "float32", "int8", "int4"};
+  if (rounds_to_bf16(usable_kernels().back())) names.emplace_back("bf16");
   for (const KernelSet& set : usable_kernels())
     if (set != kernel_set::ggml) names.emplace_back(set.name);
   return names;
