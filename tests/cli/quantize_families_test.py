@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from golden_cases import ROOT, Golden, tensors
+from program import every_third_if_sanitized
 from vla_cpp.convert.bundle import read_bundle
 
 sys.path.append(str(ROOT / "tools"))
@@ -57,7 +58,7 @@ def test_every_family_is_here():
     assert {name.split("/")[0] for name in WIDE} == set(families())
 
 
-@pytest.fixture(scope="module", params=WIDE)
+@pytest.fixture(scope="module", params=every_third_if_sanitized(WIDE))
 def wide(request, tmp_path_factory):
     case = all_cases()[request.param]
     case = replace(case, checkpoint=replace(case.checkpoint, **WIDE[request.param]))
