@@ -17,7 +17,7 @@ help:
 	@echo "make check T=processor/letterbox   build and run the tests whose file, or else whose name, has this in it"
 	@echo "make check-includes   compile every source on its own, without groups and precompiled headers"
 	@echo "make test-cuda   all tests of our kernels for CUDA, without a GPU (downloads 102 MB: NVIDIA's compiler)"
-	@echo "make test-vulkan all golden cases on --device vulkan, of which make test tries one of each family"
+	@echo "make test-vulkan all golden cases on --device vulkan, of which make test tries some"
 	@echo "make test-arm64  build for 64-bit ARM with both packages, and test that under an emulator; no part of make test, whose time its build alone would exceed"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
@@ -158,7 +158,7 @@ soak: SECONDS = 120
 soak: build
 	$(VENV)/bin/python scripts/soak.py --seconds $(SECONDS)
 
-# All golden cases, of which `make test` tries one of each family, on the first device that Vulkan has.
+# All golden cases, of which `make test` tries some, on the first device that Vulkan has.
 test-vulkan: vulkan
 	VLA_ALL_CASES=1 ctest --preset cpu -L '^vulkan$$' --output-on-failure
 
