@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import wire
 from conftest import ROOT
+from program import IS_SANITIZED
 from serve_test import Server
 
 sys.path.append(str(ROOT / "tests/client"))
@@ -122,7 +123,7 @@ def test_a_server_on_a_full_disk_stops_recording_and_answers_on(vla, golden, tmp
     assert all(file.stat().st_size <= 20_000 for file in tmp_path.rglob("*") if file.is_file())
 
 
-@pytest.mark.skipif("asan" in os.environ.get("VLA_BINARY", ""), reason="the address sanitizer takes terabytes of address space")
+@pytest.mark.skipif(IS_SANITIZED, reason="the address sanitizer takes terabytes of address space")
 def test_threads_that_the_system_does_not_give_are_an_error(vla, golden):
     """Their stacks are larger than the address space: 64 MiB each, whatever this session's own limit says."""
     arguments = ["256" if a == "2" else str(a) for a in golden.arguments()]
@@ -209,7 +210,7 @@ def test_no_file_takes_the_place_of_a_closed_stream(vla, golden, tmp_path):
     assert vla("replay", tmp_path / "recording", "--bundle", golden.bundle, "--threads", "1").code == 0
 
 
-@pytest.mark.skipif("asan" in os.environ.get("VLA_BINARY", ""), reason="the sanitizer looks at memory through descriptors of its own")
+@pytest.mark.skipif(IS_SANITIZED, reason="the sanitizer looks at memory through descriptors of its own")
 def test_sockets_that_the_system_does_not_give_are_an_error(vla, golden):
     """For each number of file descriptors, up to the one that suffices."""
     for n in range(8, 3, -1):

@@ -26,9 +26,12 @@ EXIT = {
 }
 
 
+IS_SANITIZED = "asan" in os.environ.get("VLA_BINARY", "")
+
+
 def every_third_if_sanitized(names):
     """Cases of whole families: a sanitizer watches the same code in each, and their numbers are for the plain build to test."""
-    return list(names)[:: 3 if "asan" in os.environ.get("VLA_BINARY", "") else 1]
+    return list(names)[:: 3 if IS_SANITIZED else 1]
 
 
 def _no_constant(name):
