@@ -16,8 +16,8 @@
 namespace vla {
 namespace {
 
-/// Margin for the memory by which two processes with the same work differ: file pages that the system reads ahead, and
-/// a huge page of 2 MB if the heap happens to fill one. Measured: 2.1 MB.
+/// Margin for the memory by which two processes with the same work differ: file pages that the system reads ahead.
+/// Measured: 0.9 MB.
 constexpr std::size_t kProcessesDiffer = std::size_t{3} << 20;
 
 /// The error for std::bad_alloc of containers: the act fails, and the next one starts from scratch. The strings fit

@@ -9,7 +9,7 @@
 
 namespace vla::lower {
 
-Result<Memory> Memory::map(std::size_t size, const std::string& what, int protection, int flags) {
+Result<Memory> Memory::map(std::size_t size, const std::string& what, int protection, int flags, Pages pages) {
   Memory memory;
   if (size == 0) return memory;
   void* data = mmap(nullptr, size, protection, MAP_PRIVATE | MAP_ANONYMOUS | flags, -1, 0);
@@ -19,16 +19,16 @@ Result<Memory> Memory::map(std::size_t size, const std::string& what, int protec
                  "free memory or use a smaller model"};
   memory.data_.reset(static_cast<std::byte*>(data), [size](std::byte* bytes) { munmap(bytes, size); });
   memory.size_ = size;
-  want_large_pages(data, size);
+  if (pages == Pages::large) want_large_pages(data, size);
   return memory;
 }
 
-Result<Memory> Memory::allocate(std::size_t size, const std::string& what) {
-  return map(size, what, PROT_READ | PROT_WRITE, 0);
+Result<Memory> Memory::allocate(std::size_t size, const std::string& what, Pages pages) {
+  return map(size, what, PROT_READ | PROT_WRITE, 0, pages);
 }
 
 Result<Memory> Memory::reserve(std::size_t size, const std::string& what) {
-  return map(size, what, PROT_READ, MAP_NORESERVE);
+  return map(size, what, PROT_READ, MAP_NORESERVE, Pages::large);
 }
 
 }  // namespace vla::lower
