@@ -56,6 +56,11 @@ set(GGML_CPU_REPACK OFF CACHE BOOL "" FORCE)  # quantized formats that no bundle
 set(GGML_BUILD_TESTS OFF CACHE BOOL "" FORCE)
 set(GGML_BUILD_EXAMPLES OFF CACHE BOOL "" FORCE)
 set(GGML_VULKAN ${VLA_VULKAN} CACHE BOOL "" FORCE)
+if(VLA_VULKAN)
+  find_program(VLA_GLSLC glslc REQUIRED)
+  configure_file(${CMAKE_CURRENT_LIST_DIR}/glslc.sh.in ${CMAKE_BINARY_DIR}/glslc.sh @ONLY)
+  set(Vulkan_GLSLC_EXECUTABLE ${CMAKE_BINARY_DIR}/glslc.sh CACHE FILEPATH "" FORCE)
+endif()
 set(GGML_CUDA ${VLA_CUDA_GGML} CACHE BOOL "" FORCE)
 # CUDA's compiler, or with `what` cuda also its libraries, unless VLA_CUDA_DIR names a toolkit.
 function(vla_fetch_cuda out what)
