@@ -99,6 +99,11 @@ foreach(target ggml-base ggml-cpu)
   set_property(TARGET ${target} PROPERTY SOURCES ${sources})
 endforeach()
 target_compile_options(ggml-base PRIVATE -O1)  # it makes graphs, once
+if(VLA_SANITIZE)  # its tensors lie side by side in one piece of memory, inside which a sanitizer sees nothing
+  foreach(target ggml-base ggml-cpu)
+    target_compile_options(${target} PRIVATE -fno-sanitize=all)
+  endforeach()
+endif()
 # Where a driver fails, ggml's abort is an exception that leaves its functions (src/ggml/guard.h).
 target_compile_options(ggml-base PRIVATE $<$<COMPILE_LANGUAGE:C>:-fexceptions>)
 foreach(target ggml ggml-base ggml-cpu)  # its headers are not ours to warn about

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checkpoints of openpi's JAX code: read as its PyTorch code's, with LoRA merged."""
 
+import functools
 import json
 import sys
 
@@ -45,18 +46,35 @@ def test_lora_is_merged(tmp_path, capsys):
     assert moved > 20  # sums are rounded, so that they are no copies of what they came from
 
 
-@pytest.fixture
-def checkpoint(tmp_path):
-    """Writes a checkpoint whose arrays a test may change; gives its folder."""
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Writes each checkpoint once: (where all of it is, the checkpoint inside it)."""
 
-    def write(change=lambda arrays: None, ranks=(16, 32), **how):
+    @functools.cache
+    def write(*ranks):
+        place = tmp_path_factory.mktemp("written")
+        _, folder = contracts.write(row_of("pi0_libero", jax_lora=list(ranks)), place)
+        return place, folder.relative_to(place)
+
+    return write
+
+
+@pytest.fixture
+def checkpoint(tmp_path, written):
+    """Copies a checkpoint and writes its arrays again where a test changes them; gives its folder."""
+
+    def write(change=None, ranks=(16, 32), **how):
         row = row_of("pi0_libero", jax_lora=list(ranks))
-        _, folder = contracts.write(row, tmp_path / "made")
-        lerobot = tmp_path / "made/checkpoint"
+        place, inside = written(*ranks)
+        contracts.shutil.copytree(place, tmp_path / "made")
+        folder, lerobot = tmp_path / "made" / inside, tmp_path / "made/checkpoint"
+        if not change and not how:
+            return row, folder
         tensors = {name: contracts.to_f32(contracts.values(entry), entry.dtype)
                    for name, entry in contracts.read_safetensors(str(lerobot / "model.safetensors")).entries.items()}  # fmt: skip
         arrays = jax_checkpoint.arrays_of(tensors, json.loads((lerobot / "dims.json").read_text()), dict(zip(("", "_1"), ranks)))
-        change(arrays)
+        if change:
+            change(arrays)
         contracts.shutil.rmtree(folder / "params")
         jax_checkpoint.write(folder / "params", arrays, **how)
         return row, folder
