@@ -112,27 +112,34 @@ bool is_tried(const std::string& arch, const std::string& stored) {
   return stored == "bf16" || kSmall.contains(arch) || tries_all();
 }
 
-void check_on_each_device(const PolicyEntry& entry, const std::string& stored) {
+/// All values with VLA_ALL_BUDGETS. Without it one, which is not the same for each policy.
+template <class T>
+std::vector<T> some(const std::vector<T>& values, std::size_t policy) {
+  return tries_all() ? values : std::vector<T>{values[policy % values.size()]};
+}
+
+void check_on_each_device(const PolicyEntry& entry, const std::string& stored, std::size_t policy) {
   const auto file = test::PublishedBundle::make(entry, stored);
   REQUIRE_MESSAGE(file.ok(), (file ? "" : file.error().message()));
   const auto bundle = Bundle::open(file->path());
   REQUIRE(bundle.ok());
-  for (const std::string& kernels : some_kernels()) {
+  for (const std::string& kernels : some(some_kernels(), policy)) {
     CAPTURE(kernels);
     check_least(*bundle, [&] { return open_device(2, kernels); });
   }
-  for (const Rounding rounding : {Rounding::none, Rounding::int8, Rounding::float32})
+  for (const Rounding rounding : some<Rounding>({Rounding::none, Rounding::int8, Rounding::float32}, policy))
     check_least(*bundle, [&] { return lower::CudaDevice::model("orin-agx", rounding); });
 }
 
 }  // namespace
 
 TEST_CASE("the least memory that a published policy is told to need suffices for each of its programs") {
+  std::size_t policy = 0;
   for (const std::string stored : {"bf16", "f32", "int8", "int4"})
     for (const PolicyEntry& entry : policy_registry()) {
       CAPTURE(stored);
       CAPTURE(entry.name);
-      if (is_tried(entry.name, stored)) check_on_each_device(entry, stored);
+      if (is_tried(entry.name, stored)) check_on_each_device(entry, stored, policy++);
     }
 }
 
