@@ -35,7 +35,7 @@ struct TwoProducts {
 /// code takes the weight's sign (a code is never -128), and the weight becomes its magnitude, at most 128. Pairs are
 /// widened to 32 bits immediately.
 struct SignedProducts {
-  static constexpr int kRows = 4, kStep = 512;
+  static constexpr int kRows = 5, kStep = 1024;
   static constexpr bool kSigned = true;
   static_assert(2 * 128 * 127 <= 32767);
 
@@ -51,7 +51,8 @@ struct SignedProducts {
 template <class Products>
 struct Avx2Tile {
   using V = Avx2;
-  static constexpr int kRows = Products::kRows, kColumns = 16, kBlockRows = 216, kStep = Products::kStep;
+  static constexpr int kRows = Products::kRows, kColumns = 16, kBlockRows = 216 / kRows * kRows,
+                       kStep = Products::kStep;
   static constexpr std::int64_t kBlockKiB = 640;
   static constexpr bool kEven = true, kBeside = false, kSigned = Products::kSigned;
   static constexpr RoundedLayout kLayout = RoundedLayout::none;
@@ -135,37 +136,45 @@ struct SignedTile : Avx2Tile<SignedProducts> {
   template <int kCount>
   static void many(const std::byte* x, std::int64_t x_stride, const std::byte* lines, std::int64_t depth,
                    std::int32_t* sums, bool add) {
-    const auto load = [&](int byte)
-                          VLA_LAMBDA { return _mm256_load_si256(reinterpret_cast<const __m256i*>(lines + byte)); };
+    const auto vector = [&](int i) VLA_LAMBDA { return reinterpret_cast<const __m256i*>(lines) + i; };
     const __m256i ones = _mm256_set1_epi16(1);
     __m256i sum[kCount][2];
-#pragma GCC unroll 4
+#pragma GCC unroll 5
     for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = _mm256_setzero_si256();
     for (const std::byte* const end = x + depth; x < end;)
+      for (const std::byte* const unit = x + kQuantizedUnit; x < unit;)  // a loop of its own keeps the code short
 #pragma GCC unroll 4
-      for (int s = 0; s < 4; ++s, x += 4, lines += 2 * Int8Panels::kLine) {
-        const __m256i size[2] = {load(0), load(32)}, sign[2] = {load(64), load(96)};
-#pragma GCC unroll 4
-        for (int r = 0; r < kCount; ++r) {
-          std::int32_t four;
-          std::memcpy(&four, x + r * x_stride, sizeof(four));
-          const __m256i codes = _mm256_set1_epi32(four);
-#pragma GCC unroll 2
-          for (int i = 0; i < 2; ++i) {
-            __m256i pairs;  // with intrinsics, compilers run out of registers
-            asm("vpxor %4, %2, %1\n\tvpmaddubsw %1, %3, %1\n\tvpmaddwd %5, %1, %1\n\tvpaddd %1, %0, %0"
-                : "+x"(sum[r][i]), "=&x"(pairs)
-                : "x"(codes), "x"(size[i]), "x"(sign[i]), "x"(ones));
+        for (int s = 0; s < 4; ++s, x += 4, lines += 2 * Int8Panels::kLine) {
+          const __m256i left = _mm256_load_si256(vector(0)), right = _mm256_load_si256(vector(1));
+#pragma GCC unroll 5
+          for (int r = 0; r < kCount; ++r) {
+            std::int32_t four;
+            std::memcpy(&four, x + r * x_stride, sizeof(four));
+            add_both(sum[r], _mm256_set1_epi32(four), left, right, vector(2), ones);
           }
         }
-      }
-#pragma GCC unroll 4
+#pragma GCC unroll 5
     for (int r = 0; r < kCount; ++r)
+#pragma GCC unroll 2
       for (int i = 0; i < 2; ++i) {
         auto* place = reinterpret_cast<__m256i*>(sums + r * kColumns + 8 * i);
-        const __m256i total = _mm256_add_epi32(sum[r][i], load(32 * i));
+        const __m256i total = _mm256_add_epi32(sum[r][i], _mm256_load_si256(vector(i)));
         _mm256_storeu_si256(place, add ? _mm256_add_epi32(total, _mm256_loadu_si256(place)) : total);
       }
+  }
+
+  /// Adds the products of a line. Signs are read from memory, and the two chains alternate: how many instructions a
+  /// core can start and how many can wait limit the rate before the multipliers do, most of all where another thread
+  /// shares the core. With intrinsics, compilers run out of registers.
+  static VLA_INLINE void add_both(__m256i (&sum)[2], __m256i codes, __m256i left, __m256i right, const __m256i* signs,
+                                  __m256i ones) {
+    __m256i pairs;
+    asm("vpxor %5, %2, %3\n\tvpxor %6, %2, %2\n\t"
+        "vpmaddubsw %3, %7, %3\n\tvpmaddubsw %2, %8, %2\n\t"
+        "vpmaddwd %4, %3, %3\n\tvpmaddwd %4, %2, %2\n\t"
+        "vpaddd %3, %0, %0\n\tvpaddd %2, %1, %1"
+        : "+x"(sum[0]), "+x"(sum[1]), "+&x"(codes), "=&x"(pairs)
+        : "x"(ones), "m"(signs[0]), "m"(signs[1]), "x"(left), "x"(right));
   }
 };
 
