@@ -57,7 +57,7 @@ set(GGML_BUILD_TESTS OFF CACHE BOOL "" FORCE)
 set(GGML_BUILD_EXAMPLES OFF CACHE BOOL "" FORCE)
 set(GGML_VULKAN ${VLA_VULKAN} CACHE BOOL "" FORCE)
 if(VLA_VULKAN)
-  find_program(VLA_GLSLC glslc REQUIRED)
+  find_program(VLA_GLSLC glslc HINTS $ENV{VULKAN_SDK}/bin REQUIRED)
   configure_file(${CMAKE_CURRENT_LIST_DIR}/glslc.sh.in ${CMAKE_BINARY_DIR}/glslc.sh @ONLY)
   set(Vulkan_GLSLC_EXECUTABLE ${CMAKE_BINARY_DIR}/glslc.sh CACHE FILEPATH "" FORCE)
 endif()
@@ -97,13 +97,11 @@ foreach(target ggml-base ggml-cpu)
   get_target_property(sources ${target} SOURCES)
   list(FILTER sources EXCLUDE REGEX "(^|/)(ggml-opt|gguf|repack)[.]cpp$")
   set_property(TARGET ${target} PROPERTY SOURCES ${sources})
+  if(VLA_SANITIZE MATCHES address)  # its tensors lie side by side in one piece of memory, inside which it sees nothing
+    target_compile_options(${target} PRIVATE -fno-sanitize=all)
+  endif()
 endforeach()
 target_compile_options(ggml-base PRIVATE -O1)  # it makes graphs, once
-if(VLA_SANITIZE)  # its tensors lie side by side in one piece of memory, inside which a sanitizer sees nothing
-  foreach(target ggml-base ggml-cpu)
-    target_compile_options(${target} PRIVATE -fno-sanitize=all)
-  endforeach()
-endif()
 # Where a driver fails, ggml's abort is an exception that leaves its functions (src/ggml/guard.h).
 target_compile_options(ggml-base PRIVATE $<$<COMPILE_LANGUAGE:C>:-fexceptions>)
 foreach(target ggml ggml-base ggml-cpu)  # its headers are not ours to warn about

@@ -31,8 +31,8 @@ Result<std::unique_ptr<Program>> CpuProgram::make(CpuLowering& l, const Memory& 
 }
 
 Status CpuProgram::give_addresses(CpuLowering& l) {
-  // Small pages: a dry program writes some of the constants, and would take 2 MB more or not, as addresses happen to
-  // be.
+  // Small pages: a dry program writes few of its constants. With large pages the address would decide whether that
+  // takes 2 MB more, and a process would not have the same size in every run.
   VLA_TRY(own_, Memory::allocate(l.kept_size, "constants", Pages::small));
   l.data = addresses_of(l, arena_.data(), own_.data(), [&](const Param& param) { return l.weights.data(&param); });
   for (std::size_t i = 0; i < l.values.size(); ++i)
