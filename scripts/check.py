@@ -64,15 +64,20 @@ def near(wanted):
     return [known[key] for key in difflib.get_close_matches(plain(wanted), known, n=5, cutoff=0.5)]
 
 
+def sources(file):
+    """What a file compiles: of a group, those that it includes."""
+    return [Path(name) for name in re.findall(r'^#include "(.+)"', file.read_text(), re.M)] if "Unity" in file.parts else [file]
+
+
 def programs():
     """{source file: the program that has its tests}, where several have: that of its folder."""
     out = {}
     for entry in json.loads((BUILD / "compile_commands.json").read_text()):
         # Before -o a command names the folder of its precompiled headers too; not every CMake has "output".
         target = re.search(r"-o \S*CMakeFiles/(\w+)\.dir/", entry["command"])
-        file = Path(entry["file"])
-        if target and (file not in out or target[1] == f"test_{file.parent.name}"):
-            out[file] = target[1]
+        for file in sources(Path(entry["file"])) if target else []:
+            if file not in out or target[1] == f"test_{file.parent.name}":
+                out[file] = target[1]
     return out
 
 

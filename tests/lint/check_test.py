@@ -36,6 +36,17 @@ def test_a_source_with_precompiled_headers_of_another_target_belongs_to_its_own_
     assert check.programs() == {sources["graph/work_test.cpp"]: "test_graph", sources["engine/golden_test.cpp"]: "test_engine"}
 
 
+def test_a_source_of_a_group_belongs_to_the_groups_program(tmp_path):
+    check = loaded()
+    check.BUILD = tmp_path
+    group = tmp_path / "tests/CMakeFiles/test_graph.dir/Unity/unity_0_cxx.cxx"
+    group.parent.mkdir(parents=True)
+    group.write_text(f'/* generated */\n\n#include "{ROOT}/tests/graph/work_test.cpp"\n\n#include "{ROOT}/tests/graph/other_test.cpp"\n')
+    command = f"c++ -o tests/CMakeFiles/test_graph.dir/Unity/unity_0_cxx.cxx.o -c {group}"
+    (tmp_path / "compile_commands.json").write_text(json.dumps([{"directory": str(tmp_path), "file": str(group), "command": command}]))
+    assert check.programs() == {ROOT / f"tests/graph/{name}_test.cpp": "test_graph" for name in ("work", "other")}
+
+
 def test_a_name_finds_files_and_tests():
     check = loaded()
     assert list(check.find("graph/work")) == [ROOT / "tests/graph/work_test.cpp"]
