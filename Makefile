@@ -48,10 +48,11 @@ build: packages $(STAMP)
 	cmake --build --preset cpu
 
 # libvla-vulkan.so for build/cpu, where its packages are to be had; without it the tests of Vulkan skip by name.
-vulkan: build
-	@if scripts/packages.sh vulkan; then \
-	  cmake build/cpu -DVLA_VULKAN=ON >/dev/null && cmake --build --preset cpu; \
+vulkan: packages $(STAMP)
+	@test -f build/cpu/build.ninja || cmake --preset cpu $(CMAKE_ARGS)
+	@if scripts/packages.sh vulkan; then cmake build/cpu -DVLA_VULKAN=ON >/dev/null; \
 	else echo "make: libvla-vulkan.so is not built"; fi
+	cmake --build --preset cpu
 
 # libvla-cuda.so for build/cpu. With GGML=1 also ggml's backend.
 cuda: build
@@ -138,7 +139,7 @@ tsan: packages
 	cmake --build --preset tsan
 	ctest --preset tsan --no-tests=error
 
-test: build vulkan asan
+test: vulkan asan
 	@scripts/packages.sh test || echo "make: tests on an emulated processor skip"
 	@scripts/cuda.sh .cache/nvcc nvcc || echo "make: tests of what nvcc makes of our kernels skip"
 	$(VENV)/bin/python scripts/test.py
