@@ -97,9 +97,11 @@ def compile_module(source, out, target, embeds=False):
     return ptx
 
 
-def compile_all(out, module=None, embeds=False):
+def compile_all(out, module=None, embeds=False, architectures=ARCHITECTURES):
+    """Every kernel for each target that one of the architectures runs, or one module alone."""
     jobs = [(source, out, target, embeds) for source in kernel_files() for target in targets(source)]
-    jobs = [job for job in jobs if module in (None, f"{job[0].stem}_sm{job[2]}")]
+    names = [Path(f"{source.stem}_sm{target}.ptx") for source, _, target, _ in jobs]
+    jobs = [job for job, name in zip(jobs, names) if module in (None, name.stem) and any(fits(name, sm) for sm in architectures)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(lambda job: compile_module(*job), jobs))
 
