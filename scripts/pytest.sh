@@ -11,4 +11,4 @@ if [ ! -x "$python" ]; then
   exit 1
 fi
 # Byte code and caches stay out of the tree: the lint looks at what lies in it.
-PYTHONDONTWRITEBYTECODE=1 exec "$python" -m pytest -q -rsfE -p no:cacheprovider "$@"
+PYTHONPYCACHEPREFIX="$PWD/.cache/pycache" exec "$python" -m pytest -q -rsfE -p no:cacheprovider "$@"

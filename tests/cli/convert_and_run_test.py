@@ -5,14 +5,11 @@
 import numpy as np
 import pytest
 from golden_cases import FLOAT32, NAMES, Golden, tensors
+from program import IS_SANITIZED
 
 from vla_cpp.convert import cli
 
-
-@pytest.fixture(autouse=True)
-def plain_build(vla):
-    if vla.is_sanitized():
-        pytest.skip("a sanitizer does not watch the converter, and its bundles are those of other tests")
+pytestmark = pytest.mark.skipif(IS_SANITIZED, reason="a sanitizer does not watch the converter, and its bundles are those of other tests")
 
 
 def convert(case, out, dtype):

@@ -10,6 +10,7 @@ import struct
 import pytest
 from conftest import ROOT
 from golden_cases import sealed
+from program import IS_SANITIZED
 
 DEMO = ROOT / "models/metaworld-tiny.gguf"
 LATE = 16
@@ -26,7 +27,7 @@ def report(vla):
 @pytest.fixture
 def timed(vla):
     """The program. Skips under a sanitizer, which measures itself."""
-    if vla.is_sanitized():
+    if IS_SANITIZED:
         pytest.skip("a sanitizer slows the kernels down")
     return vla
 

@@ -5,6 +5,7 @@
 import json
 import re
 import shutil
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ import pytest
 
 import wire
 from golden_cases import ROOT
-from program import EXIT
+from program import EXIT, IS_SANITIZED, every_third_if_sanitized
 from serve_test import serve  # noqa: F401, a fixture
 
 SHIPPED = ROOT / "models/metaworld-tiny.gguf"
@@ -64,8 +65,7 @@ def serving(vla, serve, options, more):
     raise AssertionError("no server within its budget")
 
 
-@pytest.mark.parametrize("kernels", ["float32", "bf16", "int8", "portable"])
-@pytest.mark.parametrize("threads", ["1", "2"])
+@pytest.mark.parametrize(("threads", "kernels"), every_third_if_sanitized(product("12", ["float32", "bf16", "int8", "portable"])))
 def test_actions_are_the_same_to_the_bit_within_any_budget(vla, run, kernels, threads):
     if kernels == "bf16" and "bf16" not in vla.cpu():
         pytest.skip(f"this processor multiplies no bf16: {vla.cpu()}")
@@ -89,9 +89,8 @@ def memory_of(server):
     return 1024 * int(re.search(r"RssAnon:\s*(\d+) kB", status)[1])
 
 
+@pytest.mark.skipif(IS_SANITIZED, reason="a sanitizer takes more memory than the policy")
 def test_a_budget_is_kept(vla, serve):
-    if vla.is_sanitized():
-        pytest.skip("a sanitizer takes more memory than the policy")
     options = (SHIPPED, "--bind", "tcp://127.0.0.1:0", "--kernels", "float32")
     tight, roomy = serving(vla, serve, options, 0), serve(*options)
     assert memory_of(tight) < memory_of(roomy) - 2_000_000

