@@ -18,7 +18,7 @@ from vla_cpp.control.limits import KINDS
 from vla_cpp.control.schedule import late_rule
 from vla_cpp.spec import BundleInfo, Spec
 
-many = settings(max_examples=N_EXAMPLE // 3, deadline=None)  # an example takes a third of a second
+many = settings(max_examples=-(-N_EXAMPLE // 3), deadline=None)  # an example takes a third of a second
 STEPS = 40
 
 
