@@ -27,7 +27,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from rotated import as_floats, rotated_tensors
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / folder) for folder in ("tools", "python", "tests/support", "tests/cli", "tests/client")]
@@ -117,17 +116,23 @@ def print_blocks(program, folder, bundle, made):
     print("      " + ", ".join(f"{path} {error[path]:.2f} %" for path in (*last.values(), worst)), flush=True)
 
 
-def write_like(bundle, content, path, changed, has_floats=False):
-    """A bundle with other values of some tensors, in its dtypes, or in float32 where it has floats.  changed: {tensor: float32}."""
+def as_floats(values, dtype):
+    return (values.astype(np.uint32) << 16).view(np.float32) if dtype == "bf16" else values
+
+
+def write_like(bundle, content, path, changed):
+    """A bundle with other values of some tensors, in its dtypes.  changed: {tensor: float32}."""
     from bundle_keys import bundle_keys
 
     from vla_cpp.convert.bundle import BundleWriter, TensorInfo
 
-    dtypes = {name: "f32" if has_floats and dtype == "bf16" else dtype for name, dtype in content.dtypes.items()}
+    dtypes = content.dtypes
 
     def stored(name, values):
-        floats = np.ascontiguousarray(changed[name], np.float32) if name in changed else values
-        if name not in changed or dtypes[name] == "f32":
+        if name not in changed:
+            return values
+        floats = np.ascontiguousarray(changed[name], np.float32)
+        if dtypes[name] == "f32":
             return floats
         bits = floats.view(np.uint32).astype(np.uint64)
         return ((bits + 0x7FFF + (bits >> 16 & 1)) >> 16).astype(np.uint16)
@@ -151,6 +156,18 @@ def chunks(bundle, observations, kernels=None):
 
     with Policy(bundle, kernels=kernels, threads=1) as policy:
         return np.array([policy.act(**one).normalized for one in observations])
+
+
+def has_bf16(bundle):
+    """Whether this machine multiplies bf16."""
+    import vla_cpp
+
+    try:
+        vla_cpp.Policy(bundle, kernels="bf16").close()
+    except vla_cpp.errors.DeviceError as error:
+        print(f"      not in bf16: {error}", flush=True)
+        return False
+    return True
 
 
 class Planter:
@@ -210,17 +227,6 @@ class Planter:
         return places
 
 
-def rotate(bundle, path, observation):
-    """The same policy in float32, its channels rotated."""
-    from vla_cpp.convert.bundle import read_bundle
-
-    content = read_bundle(str(bundle))
-    write_like(bundle, content, path, rotated_tensors(content), has_floats=True)
-    expected, got = (chunks(one, [observation], "float32") for one in (bundle, path))
-    print(f"rotated: the chunk moves by {np.abs(got - expected).max() / np.abs(expected).max():.1e} of its largest element", flush=True)
-    return path
-
-
 def record(bundle, folder, observations):
     from server_process import SECONDS, Server
 
@@ -252,7 +258,7 @@ def judge(bundle, work, recording, observations, expected, programs, dtypes, has
         print("".join(f"      {line}\n" for line in answer.stdout.splitlines() if " over " in line), end="", flush=True)
         return work / "codes.gguf"
 
-    if has_blocks:
+    if has_blocks and has_bf16(bundle):
         yield "bf16", [moved(bundle, "bf16")]
     for dtype in dtypes:
         row = [moved(quantized(programs[0], "--dtype", dtype))]
@@ -274,7 +280,6 @@ def main():
     parser.add_argument("--packages", help="folder of the packages that tools/trained_parts.py names")
     parser.add_argument("--every", type=int, default=23, help="distance of planted channels")
     parser.add_argument("--factors", default="24,50")
-    parser.add_argument("--rotated", action="store_true", help="of SmolVLA and TurboVLA both also with rotated channels (tools/rotated.py)")
     parser.add_argument("--dtypes", nargs="+", default=["int8", "int4"])
     parser.add_argument("--vla", nargs="+", default=[os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla")], help="programs to compare")
     options = parser.parse_args()
@@ -292,8 +297,6 @@ def main():
             places = planter.find(work / "planted.gguf", held[0])
             planter.write(work / "planted.gguf", places, factors)
             cases = {"as it is": bundle, f"{len(places)} of {len(planter.places)} planted": work / "planted.gguf"}
-            if options.rotated:
-                cases |= {f"{what}, rotated": rotate(one, work / f"rotated{i}.gguf", held[0]) for i, (what, one) in enumerate(cases.items())}
             for what, one in cases.items():
                 for dtype, row in judge(one, work, recording, held, chunks(one, held, "float32"), options.vla, options.dtypes, is_trained):
                     print(f"{name:<20} {what:<28} {dtype}  " + "  ".join(f"{error:6.2f} ({median:5.2f})" for error, median in row), flush=True)

@@ -130,8 +130,9 @@ void add_search(CLI::App& command, QuantizeOptions& options) {
                                 "The least error of a file of at most so many bytes: 1.8GB, 900MB");
   add_text(command, "--calibrate", options.calibration, "DIR",
            "A recording of vla serve --record: first divide channels of activations that are far larger than the "
-           "others, and multiply the matrices that read them, which leaves float32's actions as they are; then round "
-           "column by column, each making good the errors of those before it. Kept is what moves actions less");
+           "others, and multiply the matrices that read them, which leaves float32's actions as they are; then rotate "
+           "channels, which only rounds the stored floats again; then round column by column, each making good the "
+           "errors of those before it. Kept is what moves actions less");
   error->needs(judge)->excludes(size);
   size->needs(judge)->excludes("--dtype");
   error->excludes("--dtype");
@@ -171,11 +172,11 @@ Status write_codes(const QuantizeOptions& options, const CodeSource& source, con
 #ifdef VLA_SERVER
 Status calibrate_first(QuantizeOptions options) {
   const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
-  VLA_TRY(const std::vector<Judged> seen, observations(options, options.calibration));
+  VLA_TRY(std::vector<Judged> seen, observations(options, options.calibration));
   const Rounding codes = codes_of(options.dtype);
   const bool has_int4 = codes == Rounding::int4 || !options.recording.empty();
   VLA_TRY(const Calibrated made,
-          calibrate(options.from, options.to, codes, has_int4, seen, options.engine, progress(shows)));
+          calibrate(options.from, options.to, codes, has_int4, std::move(seen), options.engine, progress(shows)));
   for (const std::string& line : made.told)
     if (!options.quiet) say(stdout, "{}\n\n", line);
   options.from = made.bundle;
@@ -194,7 +195,7 @@ Status calibrate_first(QuantizeOptions options) {
 class Trials {
  public:
   explicit Trials(const std::string& to) {
-    for (const char* bundle : {"", ".smoothed", ".some"})
+    for (const char* bundle : {"", ".smoothed", ".some", ".rotated", ".rotated2"})
       for (const char* ending : {"", ".codes", ".int8", ".int4", ".trial"})
         if (*bundle != 0 || *ending != 0) files_.push_back(to + bundle + ending);
     remove();

@@ -218,13 +218,21 @@ std::string without_step(const std::string& path) {
 
 Moved moved(const Chunks& expected, const Chunks& got) {
   double value = 0, missed = 0, largest_value = 0, largest = 0;
-  for (std::size_t k = 0; k < expected.size(); ++k)
+  std::vector<double> of_each;
+  for (std::size_t k = 0; k < expected.size(); ++k) {
+    double of_one = 0;
     for (std::size_t i = 0; i < expected[k].size(); ++i) {
       const double x = expected[k][i], d = got[k][i] - x;
-      value += x * x, missed += d * d;
+      value += x * x, of_one += d * d;
       largest_value = std::max(largest_value, std::abs(x)), largest = std::max(largest, std::abs(d));
     }
-  return value > 0 ? Moved{std::sqrt(missed / value), largest / largest_value} : Moved{};
+    missed += of_one;
+    of_each.push_back(of_one * static_cast<double>(expected.size()));
+  }
+  if (value == 0) return {};
+  const auto middle = of_each.begin() + static_cast<std::ptrdiff_t>(of_each.size() / 2);
+  std::ranges::nth_element(of_each, middle);
+  return {std::sqrt(missed / value), largest / largest_value, std::sqrt(*middle / value)};
 }
 
 Choice choice_of(const std::vector<Block>& blocks) {

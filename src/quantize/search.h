@@ -13,6 +13,7 @@ namespace vla {
 struct Moved {
   double rms = 0;      // root mean square of the differences, over that of the chunks
   double largest = 0;  // largest difference, over the largest magnitude
+  double median = 0;   // root mean square of the median observation's differences, over that of all chunks
 };
 
 /// An observation to judge a policy by, and its noise.

@@ -5,15 +5,10 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <bit>
 #include <cmath>
 
-#include "base/bf16.h"
-#include "base/file.h"
-#include "bundle/gguf_writer.h"
-#include "kernels/numbers.h"
-#include "quantize/code_maker.h"
 #include "quantize/smoothing_places.h"
+#include "quantize/tensor_rows.h"
 
 namespace vla {
 namespace {
@@ -49,50 +44,14 @@ struct Factors {
   std::vector<float> rows, columns;
 };
 
-/// Reads and writes tensors part by part, applying factors.
-class Scaler {
- public:
-  explicit Scaler(const Bundle& bundle) : bundle_(bundle) {}
-
-  /// Passes the rows of a tensor to `see` as floats.
-  Status each_row(const TensorInfo& tensor, const std::function<void(std::int64_t row, std::span<float>)>& see) {
-    const std::int64_t d = tensor.shape.front(), n_row = tensor.count() / d;
-    const std::size_t row_size = dtype_size(tensor.type, d);
-    for (std::int64_t first = 0; first < n_row; first += kPartRows) {
-      const std::int64_t n = std::min(kPartRows, n_row - first);
-      VLA_TRY(const auto part, bundle_.read(tensor.data.subspan(static_cast<std::size_t>(first) * row_size,
-                                                                static_cast<std::size_t>(n) * row_size),
-                                            buffer_));
-      row_.resize(static_cast<std::size_t>(d));
-      for (std::int64_t i = 0; i < n; ++i) {
-        for (std::int64_t k = 0; k < d; ++k)
-          row_[static_cast<std::size_t>(k)] = kernels::stored_number(tensor.type, part.data(), i * d + k);
-        see(first + i, row_);
-      }
-    }
-    return {};
-  }
-
-  Status write(const TensorInfo& tensor, const Factors& factors, BundleFile& out) {
-    std::vector<std::uint16_t> rounded;
-    const Status written = each_row(tensor, [&](std::int64_t row, std::span<float> values) {
-      const float of_row = factors.rows.empty() ? 1 : factors.rows[static_cast<std::size_t>(row)];
-      for (std::size_t k = 0; k < values.size(); ++k)
-        values[k] *= of_row * (factors.columns.empty() ? 1 : factors.columns[k]);
-      if (tensor.type == DType::f32) return out.put(std::as_bytes(values));
-      rounded.assign(values.size(), 0);
-      std::ranges::transform(values, rounded.begin(), [](float value) { return to_bf16(value); });
-      out.put(std::as_bytes(std::span(rounded)));
-    });
-    out.end_tensor();
-    return written;
-  }
-
- private:
-  const Bundle& bundle_;
-  ReadBuffer buffer_;
-  std::vector<float> row_;
-};
+Status put_scaled(const Bundle& bundle, const TensorInfo& tensor, const Factors& factors, BundleFile& out) {
+  return each_row(bundle, tensor, [&](std::int64_t row, std::span<float> values) {
+    const float of_row = factors.rows.empty() ? 1 : factors.rows[static_cast<std::size_t>(row)];
+    for (std::size_t k = 0; k < values.size(); ++k)
+      values[k] *= of_row * (factors.columns.empty() ? 1 : factors.columns[k]);
+    put_floats(values, tensor.type, out);
+  });
+}
 
 /// The nearest power of two, or 1 if the factor is small.
 float power_of_two(double value) {
@@ -121,39 +80,23 @@ void multiply(std::vector<float>& factors, const std::vector<float>& by, bool in
   for (std::size_t i = 0; i < by.size(); ++i) factors[i] *= inverse ? 1 / by[i] : by[i];
 }
 
-/// Makes scalings of places. A parameter's tensor is found by its offset in the file, since robots of a bundle share
-/// tensors.
-class Scalings {
- public:
-  Scalings(const Bundle& bundle, const Bundle& opened) : opened_(opened), scaler_(bundle) {
-    for (const TensorInfo& tensor : bundle.tensors()) by_offset_[bundle.offset(tensor.data.data())] = &tensor;
+/// Makes the scaling of a place.
+Result<Scaling> scaling_of(const SmoothingPlace& place, const std::vector<float>& range, const Bundle& bundle,
+                           const TensorsOfParams& tensors) {
+  Scaling made = {.path = place.path};
+  std::vector<float> w(range.size());
+  for (const Param* matrix : place.readers) {
+    made.readers.push_back(tensors.of(matrix).name);
+    VLA_CHECK(each_row(bundle, tensors.of(matrix), [&](std::int64_t, std::span<float> row) {
+      for (std::size_t k = 0; k < row.size(); ++k) w[k] = std::max(w[k], std::abs(row[k]));
+    }));
   }
-
-  Result<Scaling> of(const SmoothingPlace& place, const std::vector<float>& range) {
-    Scaling made = {.path = place.path};
-    std::vector<float> w(range.size());
-    for (const Param* matrix : place.readers) {
-      made.readers.push_back(tensor_of(matrix).name);
-      VLA_CHECK(scaler_.each_row(tensor_of(matrix), [&](std::int64_t, std::span<float> row) {
-        for (std::size_t k = 0; k < row.size(); ++k) w[k] = std::max(w[k], std::abs(row[k]));
-      }));
-    }
-    made.by = divisors(range, w);
-    for (const Param* param : {place.weight, place.bias})
-      if (param != nullptr)
-        (param->storage == Storage::matrix ? made.rows : made.vectors).push_back(tensor_of(param).name);
-    return made;
-  }
-
- private:
-  const TensorInfo& tensor_of(const Param* param) const {
-    return *by_offset_.at(opened_.offset(param->source->data.data()));
-  }
-
-  const Bundle& opened_;  // the bundle that owns the parameters
-  Scaler scaler_;
-  std::map<std::ptrdiff_t, const TensorInfo*> by_offset_;
-};
+  made.by = divisors(range, w);
+  for (const Param* param : {place.weight, place.bias})
+    if (param != nullptr)
+      (param->storage == Storage::matrix ? made.rows : made.vectors).push_back(tensors.of(param).name);
+  return made;
+}
 
 /// Returns the factors by tensor name.
 std::map<std::string, Factors> factors_of(std::span<const Scaling> scalings) {
@@ -164,16 +107,6 @@ std::map<std::string, Factors> factors_of(std::span<const Scaling> scalings) {
     for (const std::string& matrix : scaling.rows) multiply(factors[matrix].rows, scaling.by, true);
   }
   return factors;
-}
-
-Status write_tensors(const Bundle& bundle, const std::map<std::string, Factors>& factors, BundleFile& out) {
-  Scaler scaler(bundle);
-  for (const TensorInfo& tensor : bundle.tensors()) {
-    const auto found = factors.find(tensor.name);
-    VLA_CHECK(found != factors.end() ? scaler.write(tensor, found->second, out)
-                                     : out.copy(bundle, tensor, [](std::size_t) {}));
-  }
-  return {};
 }
 
 }  // namespace
@@ -194,27 +127,23 @@ Result<Smoothing> find_smoothing(const std::string& bundle, std::span<const Judg
   Smoothing found = {.n_place = static_cast<int>(places.size())};
   VLA_TRY(const Ranges ranges, measure_ranges(bundle, places, observations, options, found.chunks));
   VLA_TRY(const Bundle file, Bundle::open(bundle));
-  Scalings scalings(file, engine->robot().bundle());
+  const TensorsOfParams tensors(file, engine->robot().bundle());
   for (const SmoothingPlace& place : places) {
     const auto range = ranges.find(place.path);
     if (range == ranges.end()) continue;
-    VLA_TRY(Scaling made, scalings.of(place, range->second));
+    VLA_TRY(Scaling made, scaling_of(place, range->second, file, tensors));
     if (std::ranges::any_of(made.by, [](float by) { return by != 1; })) found.scalings.push_back(std::move(made));
   }
   return found;
 }
 
 Status write_smoothed(const std::string& from, const std::string& to, std::span<const Scaling> scalings) {
-  VLA_TRY(const Bundle bundle, Bundle::open(from));
-  Keys keys = bundle.keys();
-  keys.set("vla.checksum", std::string(kNoChecksum));
-  Status made;
-  VLA_CHECK(write_file(to, [&](int file) {
-    BundleFile out(file, keys, bundle.tensors());
-    made = write_tensors(bundle, factors_of(scalings), out);
-    return made && out.seal();
-  }));
-  return made;
+  const std::map<std::string, Factors> factors = factors_of(scalings);
+  return write_changed(
+      from, to, [&](const TensorInfo& tensor) { return factors.contains(tensor.name); },
+      [&](const Bundle& bundle, const TensorInfo& tensor, BundleFile& out) {
+        return put_scaled(bundle, tensor, factors.at(tensor.name), out);
+      });
 }
 
 }  // namespace vla

@@ -142,7 +142,7 @@ def test_channels_that_are_far_larger_than_the_others_are_smoothed(recording, tm
     int8 = moved(SHIPPED.bundle, "int8")  # without outliers
     assert rough > 3 * smooth, (rough, smooth)
     assert smooth < 1.5 * int8, (smooth, int8)
-    assert re.match(r"smoothed over 2 observations: \d+ channels of \d+ of \d+ norms and MLPs divided, by \d+ at most; int8 moves chunks by ", told)
+    assert re.match(r"smoothed over 2 observations: \d+ channels of \d+ of \d+ norms and MLPs divided, by \d+ at most; int8 moves chunks of 2 of them by ", told)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["planted.gguf", "rough.gguf", "smooth.gguf"]
     assert "smoothed over 2 observations" in read_bundle(str(tmp_path / "smooth.gguf")).keys["vla.quantization"]
 
