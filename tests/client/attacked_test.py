@@ -8,8 +8,6 @@ import sys
 import pytest
 from server_process import ROOT, VLA, first_in_line
 
-pytestmark = pytest.mark.alone
-
 # The tests may share their two cores with anything. What an attack once cost was seconds, or hundreds of megabytes.
 LOOSE = 25
 
