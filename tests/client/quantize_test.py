@@ -158,6 +158,12 @@ def test_calibrated_codes_move_chunks_less(recording, tmp_path, dtype, share):
     assert told and int(told[2]) > 0.9 * int(told[3])
     assert ("rounded by Hessians" in read_bundle(str(made)).keys["vla.quantization"]) == (told[1] is None)
     assert told[1] is None or dtype == "int8"  # whose errors are mostly those of activations
+    rotated = re.search(r"^(not )?rotated over 2 observations: channels of (.*); int. moves chunks of 2 of them by (.*) % instead of (.*) %$", answer.stdout, re.M)
+    after, before = float(rotated[3]), float(rotated[4])
+    assert after == before if rotated[1] else after < 0.95 * before + 0.001
+    assert ("; rotated over" in "; " + read_bundle(str(made)).keys["vla.quantization"]) == (rotated[1] is None)
+    if rotated[1]:
+        assert rotated[2] == "expert, heads, lm, vision"
     assert plain.stat().st_size == pytest.approx(made.stat().st_size, abs=1024)
 
     def error(bundle):
