@@ -6,6 +6,8 @@
 
 #include <algorithm>
 
+#include "quantize/graphs.h"
+
 namespace vla {
 namespace {
 
@@ -21,9 +23,8 @@ Result<Hessians> Hessians::of(const std::string& bundle, std::span<const Judged>
   options.kernels = "float32";
   Hessians hessians(bundle, observations, options);
   MatrixInputs inputs;
-  options.dry = true, options.memory = 0;
-  options.see_graph = [&](const Graph& graph) { add_inputs(graph, inputs); };
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(bundle, options));
+  VLA_TRY(const std::unique_ptr<Engine> engine,
+          see_graphs(bundle, options, [&](const Graph& graph) { add_inputs(graph, inputs); }));
   for (auto& [bytes, paths] : inputs)
     if (!paths.contains("")) hessians.inputs_.emplace(engine->robot().bundle().offset(bytes), std::move(paths));
   return hessians;

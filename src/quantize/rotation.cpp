@@ -4,6 +4,7 @@
 
 #include <algorithm>
 
+#include "quantize/graphs.h"
 #include "quantize/rotation_places.h"
 #include "quantize/rotator.h"
 #include "quantize/tensor_rows.h"
@@ -153,11 +154,7 @@ bool has_seen_all(const RotationPlaces& finder, const ParamList& list) {
 Result<Rotations> find_rotations(const std::string& bundle, const EngineOptions& options) {
   RotationPlaces finder;
   VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(bundle, {.n_thread = options.n_thread,
-                                .kernels = "float32",
-                                .dry = true,
-                                .all_robots = options.all_robots,
-                                .see_graph = [&](const Graph& graph) { finder.see(graph); }}));
+          see_graphs(bundle, options, [&](const Graph& graph) { finder.see(graph); }));
   if (!has_seen_all(finder, engine->params())) return Rotations();
   VLA_TRY(const Bundle file, Bundle::open(bundle));
   const TensorsOfParams tensors(file, engine->robot().bundle());
@@ -174,9 +171,9 @@ Status write_rotated(const std::string& from, const std::string& to, std::span<c
   VLA_TRY(const Bundle bundle, Bundle::open(from));
   VLA_TRY(const Changes changes, changes_of(bundle, rotations));
   return write_changed(
-      from, to, [&](const TensorInfo& tensor) { return changes.contains(tensor.name); },
-      [&](const Bundle& opened, const TensorInfo& tensor, BundleFile& out) {
-        return put_changed(opened, tensor, changes.at(tensor.name), out);
+      bundle, to, [&](const TensorInfo& tensor) { return changes.contains(tensor.name); },
+      [&](const TensorInfo& tensor, BundleFile& out) {
+        return put_changed(bundle, tensor, changes.at(tensor.name), out);
       });
 }
 

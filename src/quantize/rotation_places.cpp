@@ -5,26 +5,13 @@
 #include <algorithm>
 #include <numeric>
 
+#include "quantize/graphs.h"
 #include "quantize/matrix_inputs.h"
 
 namespace vla {
 namespace {
 
-using Readers = std::map<const Node*, std::vector<const Node*>>;
-
 constexpr std::int64_t kLeastRotated = 16;  // fewer channels have little to share
-
-const Param* parameter_of(const Node& node) {
-  const auto* leaf = node.as<op::Parameter>();
-  return leaf != nullptr ? leaf->param : nullptr;
-}
-
-bool is_float(const Param& param) { return param.encoding.type == DType::f32 || param.encoding.type == DType::bf16; }
-
-bool is_product_of_floats(const Node& node) {
-  const auto* linear = node.as<op::Linear>();
-  return linear != nullptr && linear->rule == op::Rule::floats && is_float(*linear->weight);
-}
 
 /// Whether a node only moves whole tokens, or appends them to each other.
 bool keeps_tokens_whole(const Node& node) {
@@ -33,24 +20,14 @@ bool keeps_tokens_whole(const Node& node) {
   return node.as<op::Reshape>() != nullptr && node.shape[0] % node.in[0].dim(0) == 0;
 }
 
-/// Collects the products that read a value's tokens. False if anything else reads it.
-bool find_products(const Node& value, const Readers& readers, std::set<const Node*>& products) {
-  const auto found = readers.find(&value);
-  if (found == readers.end()) return true;
-  return std::ranges::all_of(found->second, [&](const Node* reader) {
-    if (keeps_tokens_whole(*reader)) return find_products(*reader, readers, products);
-    if (!is_product_of_floats(*reader)) return false;
-    products.insert(reader);
-    return true;
-  });
-}
-
 /// The gain of the product y in y * gain, if nothing else reads y; else null.
 const Param* gain_of_product(const Node& node, const Readers& readers) {
   if (node.as<op::Multiply>() == nullptr) return nullptr;
   const Node &y = *node.in[0].node(), &by = *node.in[1].node();
   const bool is_one_token = by.shape == Shape{y.shape[0], 1, 1, 1};
-  return is_product_of_floats(y) && readers.at(&y).size() == 1 && is_one_token ? parameter_of(by) : nullptr;
+  const auto* product = y.as<op::Linear>();
+  const bool is_of_floats = product != nullptr && product->rule == op::Rule::floats;
+  return is_of_floats && readers.at(&y).size() == 1 && is_one_token ? parameter_of(by) : nullptr;
 }
 
 }  // namespace
@@ -92,14 +69,14 @@ struct Follower {
   void operator()(const op::Gather&) { join(0); }
   void operator()(const op::Norm&) {
     join(0);
-    if (std::string& path = places.values_[static_cast<std::size_t>(places.root(out()))].path; path.empty())
-      path = node->path;
+    if (std::string& path = places.values_of(out()).path; path.empty()) path = node->path;
     if (node->in.size() == 1) return;
     const bool has_bias = node->in.size() > 2;
     const Param* const gain = parameter_of(*node->in[1].node());
     const Param* const bias = has_bias ? parameter_of(*node->in[2].node()) : nullptr;
-    std::set<const Node*> products;
-    const bool can_fold = gain != nullptr && has_bias == (bias != nullptr) && find_products(*node, readers, products);
+    std::vector<const Node*> products;
+    const bool can_fold =
+        gain != nullptr && has_bias == (bias != nullptr) && find_products(*node, readers, keeps_tokens_whole, products);
     for (const Param* vector : {gain, bias}) note_rows(vector, can_fold ? gain : nullptr);
     if (!can_fold) return fix_all();
     if (has_bias) join(2);
@@ -119,7 +96,7 @@ struct Follower {
       places.fix(in(i));
       join(i + 1);
     }
-    places.values_[static_cast<std::size_t>(places.root(out()))].is_heads = true;
+    places.values_of(out()).is_heads = true;
   }
   void operator()(const op::Activate&) { fix_all(); }
   void operator()(const op::Add&) { node->in[1].dim(0) == node->shape[0] ? join_all() : fix_all(); }
@@ -201,11 +178,10 @@ int RotationPlaces::root(int id) const {
 }
 
 void RotationPlaces::join(int a, int b) {
-  a = root(a), b = root(b);
-  if (a == b) return;
-  Values &to = values_[static_cast<std::size_t>(std::min(a, b))],
-         &of = values_[static_cast<std::size_t>(std::max(a, b))];
-  of.parent = std::min(a, b);
+  const auto [first, second] = std::minmax({root(a), root(b)});
+  if (first == second) return;
+  Values &to = values_of(first), &of = values_of(second);
+  of.parent = first;
   to.d = std::gcd(to.d, of.d);
   to.is_fixed = to.is_fixed || of.is_fixed;
   to.is_heads = to.is_heads || of.is_heads;
@@ -213,7 +189,7 @@ void RotationPlaces::join(int a, int b) {
 }
 
 void RotationPlaces::narrow(int id, std::int64_t d) {
-  Values& values = values_[static_cast<std::size_t>(root(id))];
+  Values& values = values_of(id);
   values.d = std::gcd(values.d, d);
 }
 
@@ -233,11 +209,10 @@ int RotationPlaces::id_of(const Slot* slot) {
 }
 
 void RotationPlaces::see(const Graph& graph) {
-  Readers readers;
+  const Readers readers = readers_of(graph);
   Follower follower = {.places = *this, .readers = readers};
   std::set<const Slot*> read, written;
   for (const Node& node : graph.nodes()) {
-    for (const Tensor& in : node.in) readers[in.node()].push_back(&node);
     follower.ids.push_back(add(node.shape[0]));
     if (const auto* input = node.as<op::Input>()) read.insert(input->slot);
     if (const auto* write = node.as<op::Write>()) written.insert(write->slot);

@@ -65,9 +65,10 @@ class RotationPlaces {
 
   int add(std::int64_t d);
   int root(int id) const;
+  Values& values_of(int id) { return values_[static_cast<std::size_t>(root(id))]; }
   void join(int a, int b);
   void narrow(int id, std::int64_t d);
-  void fix(int id) { values_[static_cast<std::size_t>(root(id))].is_fixed = true; }
+  void fix(int id) { values_of(id).is_fixed = true; }
   int id_of(const Param* param, int dimension);
   int id_of(const Slot* slot);
   RotationPlaces with_conditions() const;

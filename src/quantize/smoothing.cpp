@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "quantize/graphs.h"
 #include "quantize/smoothing_places.h"
 #include "quantize/tensor_rows.h"
 
@@ -116,11 +117,7 @@ Result<Smoothing> find_smoothing(const std::string& bundle, std::span<const Judg
   options.kernels = "float32";
   SmoothingPlaces finder;
   VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(bundle, {.n_thread = options.n_thread,
-                                .kernels = options.kernels,
-                                .dry = true,
-                                .all_robots = options.all_robots,
-                                .see_graph = [&](const Graph& graph) { finder.see(graph); }}));
+          see_graphs(bundle, options, [&](const Graph& graph) { finder.see(graph); }));
   const std::vector<SmoothingPlace> places = finder.found();
   if (places.empty())
     return Error{Code::unsupported, bundle, "norms or gated MLPs whose channels may be divided", "none"};
@@ -138,10 +135,11 @@ Result<Smoothing> find_smoothing(const std::string& bundle, std::span<const Judg
 }
 
 Status write_smoothed(const std::string& from, const std::string& to, std::span<const Scaling> scalings) {
+  VLA_TRY(const Bundle bundle, Bundle::open(from));
   const std::map<std::string, Factors> factors = factors_of(scalings);
   return write_changed(
-      from, to, [&](const TensorInfo& tensor) { return factors.contains(tensor.name); },
-      [&](const Bundle& bundle, const TensorInfo& tensor, BundleFile& out) {
+      bundle, to, [&](const TensorInfo& tensor) { return factors.contains(tensor.name); },
+      [&](const TensorInfo& tensor, BundleFile& out) {
         return put_scaled(bundle, tensor, factors.at(tensor.name), out);
       });
 }

@@ -38,16 +38,15 @@ void put_floats(std::span<const float> values, DType dtype, BundleFile& out) {
   out.put(std::as_bytes(std::span(rounded)));
 }
 
-Status write_changed(const std::string& from, const std::string& to,
+Status write_changed(const Bundle& bundle, const std::string& to,
                      const std::function<bool(const TensorInfo&)>& is_changed,
-                     const std::function<Status(const Bundle&, const TensorInfo&, BundleFile&)>& write) {
-  VLA_TRY(const Bundle bundle, Bundle::open(from));
+                     const std::function<Status(const TensorInfo&, BundleFile&)>& write) {
   Keys keys = bundle.keys();
   keys.set("vla.checksum", std::string(kNoChecksum));
   const auto write_all = [&](BundleFile& out) -> Status {
     for (const TensorInfo& tensor : bundle.tensors()) {
       if (is_changed(tensor)) {
-        VLA_CHECK(write(bundle, tensor, out));
+        VLA_CHECK(write(tensor, out));
         out.end_tensor();
       } else {
         VLA_CHECK(out.copy(bundle, tensor, [](std::size_t) {}));

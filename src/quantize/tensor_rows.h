@@ -19,10 +19,10 @@ Status each_row(const Bundle& bundle, const TensorInfo& tensor,
 void put_floats(std::span<const float> values, DType dtype, BundleFile& out);
 
 /// Writes a bundle with the keys and the shapes of another one. `write` puts the elements of each tensor that
-/// `is_changed`; the others are copied. Errors: io; those of Bundle::open and of `write`.
-Status write_changed(const std::string& from, const std::string& to,
+/// `is_changed`; the others are copied. Errors: io; those of Bundle::read and of `write`.
+Status write_changed(const Bundle& bundle, const std::string& to,
                      const std::function<bool(const TensorInfo&)>& is_changed,
-                     const std::function<Status(const Bundle&, const TensorInfo&, BundleFile&)>& write);
+                     const std::function<Status(const TensorInfo&, BundleFile&)>& write);
 
 /// The tensors of parameters, found by their offset in the file, since robots of a bundle share tensors.
 class TensorsOfParams {

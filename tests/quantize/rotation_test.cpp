@@ -9,11 +9,11 @@
 #include <algorithm>
 #include <cmath>
 
+#include "quantize/ones.h"
 #include "quantize/rotation_places.h"
 #include "quantize/rotator.h"
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
-#include "support/param_set.h"
 
 namespace rotation_test {
 
@@ -56,14 +56,7 @@ struct Stream {
     return names;
   }
 
-  static std::vector<ParamSet::Piece> pieces() {
-    std::vector<ParamSet::Piece> all;
-    for (const char* name : {"first", "up", "down", "last"})
-      all.push_back({name, {kWidth, kWidth}, std::vector<float>(kWidth * kWidth, 1)});
-    for (const char* name : {"norm", "bias", "gain"}) all.push_back({name, {kWidth}, std::vector<float>(kWidth, 1)});
-    return all;
-  }
-  ParamSet set{pieces()};
+  ParamSet set{ones(kWidth, {"first", "up", "down", "last"}, {"norm", "bias", "gain"})};
   std::map<std::string, const Param*> vectors, matrices;
   Slots slots;
   Graph g{slots};

@@ -8,10 +8,10 @@
 
 #include <algorithm>
 
+#include "quantize/ones.h"
 #include "quantize/smoothing_places.h"
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
-#include "support/param_set.h"
 
 namespace smoothing_test {
 
@@ -44,14 +44,7 @@ struct Places {
     return paths;
   }
 
-  static std::vector<ParamSet::Piece> pieces() {
-    std::vector<ParamSet::Piece> all;
-    for (const char* name : {"a", "b", "gate", "up", "down"})
-      all.push_back({name, {kWidth, kWidth}, std::vector<float>(kWidth * kWidth, 1)});
-    for (const char* name : {"norm", "bias"}) all.push_back({name, {kWidth}, std::vector<float>(kWidth, 1)});
-    return all;
-  }
-  ParamSet set{pieces()};
+  ParamSet set{ones(kWidth, {"a", "b", "gate", "up", "down"}, {"norm", "bias"})};
   const Param *norm, *bias;
   std::map<std::string, const Param*> matrices;
   Slots slots;
