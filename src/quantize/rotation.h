@@ -8,7 +8,7 @@
 
 namespace vla {
 
-/// A vector of a bundle that goes into matrices before channels are rotated; it becomes ones.
+/// A gain that is folded into matrices before channels are rotated, then set to ones.
 struct Folded {
   std::string gain;
   std::string bias;                        // divided by the gain; empty if there is none

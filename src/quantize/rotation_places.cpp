@@ -139,7 +139,7 @@ struct Follower {
     places.join(made.id, out());
     return made.folded;
   }
-  /// The result is a vector or rows of a table. What a product may do to a matrix, it may not do to these.
+  /// Handles a node that returns a vector or rows of a table. A product may not rotate or scale these rows.
   void read_rows(const Param* table) {
     places.join(out(), places.id_of(table, 0));
     if (table->shape.size() == 1) return;
@@ -235,7 +235,7 @@ void RotationPlaces::see(const Graph& graph) {
   }
 }
 
-/// The same with the values fixed that a condition over all graphs keeps as they are.
+/// Returns a copy in which everything is fixed that only all graphs together can tell must not be rotated.
 RotationPlaces RotationPlaces::with_conditions() const {
   RotationPlaces all = *this;
   // What one graph writes for another is the graphs' own; the caller sees all other slots.

@@ -12,7 +12,7 @@
 
 namespace vla {
 
-/// A vector that multiplies channels where they are rotated. It goes into matrices and becomes ones.
+/// The gain of a norm or a product whose channels are rotated. It is folded into matrices, then set to ones.
 struct FoldedGain {
   const Param* gain = nullptr;
   const Param* bias = nullptr;     // of a norm: divided by the gain; may be null
@@ -78,7 +78,7 @@ class RotationPlaces {
   std::map<const Slot*, SlotUse> slots_;
   std::map<const Param*, Fold> folds_;  // by gain
   Gains columns_of_;                    // by matrix: the gains of what it multiplies
-  Gains rows_of_;                       // by matrix or vector: the gains that it is, belongs to or is multiplied by
+  Gains rows_of_;  // by matrix or vector: the gains of its rows; a gain and its bias have the gain itself
 };
 
 }  // namespace vla
