@@ -14,6 +14,7 @@
 #include "serve/first_frames.h"
 #include "serve/names.h"
 #include "serve/native/codec.h"
+#include "serve/protocols.h"
 #include "serve/server.h"
 
 namespace vla::cli {

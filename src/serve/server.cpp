@@ -16,14 +16,9 @@
 #include "base/out_of_memory.h"
 #include "base/thread.h"
 #include "net/descriptors.h"
-#include "serve/door/front.h"
 #include "serve/double_buffer.h"
 #include "serve/first_frames.h"
-#include "serve/gr00t/front.h"
-#include "serve/lerobot/codec.h"
-#include "serve/native/codec.h"
-#include "serve/native/front.h"
-#include "serve/openpi/front.h"
+#include "serve/protocols.h"
 
 namespace vla::serve {
 namespace {
@@ -32,49 +27,11 @@ constexpr std::size_t kQueueMessages = 8;  // waiting acts may together hold thi
 /// File descriptors that connections leave free: for monitoring, the log, the recording and the listening sockets.
 constexpr std::size_t kKeptDescriptors = 16;
 
-using Opened = Result<std::unique_ptr<Front>>;
-
-template <class Protocol>
-Opened open_front(net::Loop& loop, const ServerOptions& options) {
-  VLA_TRY(std::unique_ptr<Front> front, Protocol::open(loop, options));
-  return front;
-}
-
-Result<Names> native_names_of(const ServerOptions& options, const v1::Description& description) {
-  return native_names({options.preset, options.map, options.absent}, description);
-}
-
-Result<Names> lerobot_names_of(const ServerOptions& options, const v1::Description& description) {
-  return lerobot::lerobot_names({{}, options.map, options.absent}, description);
-}
-
-const DoorFront::Door kLeRobot{"vla-door-lerobot",      "--lerobot",     "lerobot", "grpc://",
-                               &ServerOptions::lerobot, lerobot_names_of};
-
-/// A protocol and its front end.
-struct Protocol {
-  const char* name;
-  std::string ServerOptions::*address;  // its address; not served if empty; null: always served
-  std::size_t n_descriptor;             // descriptors that a connection takes in this process
-  Opened (*open)(net::Loop& loop, const ServerOptions& options);
-  Result<Names> (*names_of)(const ServerOptions& options, const v1::Description& description);
-
-  bool is_wanted(const ServerOptions& options) const { return address == nullptr || !(options.*address).empty(); }
-};
-const Protocol kProtocols[] = {
-    {"native", nullptr, 1, open_front<NativeFront>, native_names_of},
-    {"openpi", &ServerOptions::openpi, 1, open_front<openpi::Front>, openpi::Front::names_of},
-    {"gr00t", &ServerOptions::gr00t, 1, open_front<gr00t::Front>, gr00t::Front::names_of},
-    {"lerobot", &ServerOptions::lerobot, 0,
-     [](net::Loop& loop, const ServerOptions& options) { return DoorFront::open(loop, options, kLeRobot); },
-     lerobot_names_of},
-};
-
 /// Limits the connections to the available file descriptors, so that monitoring can reach a server whose connections
 /// are all in use. Errors: io.
 Result<ServerOptions> within_descriptors(ServerOptions options) {
   std::size_t n_each = 0;
-  for (const Protocol& protocol : kProtocols) n_each += protocol.is_wanted(options) ? protocol.n_descriptor : 0;
+  for (const Protocol& protocol : all_protocols()) n_each += protocol.is_wanted(options) ? protocol.n_descriptor : 0;
   const std::size_t spare = net::spare_descriptors();
   if (spare < kKeptDescriptors + n_each)
     return Error{Code::io, "ulimit -n",
@@ -98,19 +55,6 @@ v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
 
 }  // namespace
 
-std::vector<std::string> protocols() {
-  std::vector<std::string> names;
-  for (const Protocol& protocol : kProtocols) names.emplace_back(protocol.name);
-  return names;
-}
-
-Result<Names> names_of(const std::string& protocol, const ServerOptions& options, const v1::Description& description) {
-  const auto is_it = [&](const Protocol& each) { return protocol == each.name; };
-  const auto found = std::find_if(std::begin(kProtocols), std::end(kProtocols), is_it);
-  if (found == std::end(kProtocols)) return Error{Code::usage, "protocol", "a protocol of this server", protocol};
-  return found->names_of(options, description);
-}
-
 Exchange::Jobs::Limits Server::limits_of(const ServerOptions& options) {
   return {options.max_queue, kQueueMessages * options.max_message};
 }
@@ -120,7 +64,7 @@ Result<std::unique_ptr<Server>> Server::open(const ServerOptions& asked, Now now
   std::unique_ptr<Server> server(new Server(options, now));
   VLA_TRY(server->limits_, read_limits(options));
   if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
-  for (const Protocol& protocol : kProtocols) {
+  for (const Protocol& protocol : all_protocols()) {
     if (!protocol.is_wanted(options)) continue;
     VLA_TRY(auto front, protocol.open(server->loop_, options));
     server->fronts_.push_back(std::move(front));

@@ -10,18 +10,10 @@
 
 #include "engine/engine.h"
 #include "serve/io.h"
-#include "serve/names.h"
 #include "serve/options.h"
 #include "serve/seen_sizes.h"
 
 namespace vla::serve {
-
-/// The protocols that a server may speak: native, openpi, gr00t, lerobot.
-std::vector<std::string> protocols();
-
-/// The names that a protocol's clients use for a policy's views and states, with these options. Errors: usage, also if
-/// the protocol cannot carry the policy's inputs.
-Result<Names> names_of(const std::string& protocol, const ServerOptions& options, const v1::Description& description);
 
 /// Serves policies in memory over the sockets of the front ends. It keeps no state between requests.
 class Server {
