@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test soak check check-includes arm64 test-arm64 test-budgets test-cuda test-vulkan build vulkan cuda gpu-kit wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
+.PHONY: help demo libero test test-tools soak check check-includes arm64 test-arm64 test-budgets test-cuda test-vulkan build vulkan cuda gpu-kit wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -139,10 +139,16 @@ tsan: packages
 	cmake --build --preset tsan
 	ctest --preset tsan --no-tests=error
 
-test: vulkan asan
+# What tests need besides is downloaded while the first build compiles.
+test: packages $(STAMP)
+	@$(MAKE) --no-print-directory -j2 asan test-tools
+	@$(MAKE) --no-print-directory vulkan
+	$(VENV)/bin/python scripts/test.py
+
+test-tools: packages $(STAMP)
+	@scripts/packages.sh vulkan || true
 	@scripts/packages.sh test || echo "make: tests on an emulated processor skip"
 	@scripts/cuda.sh .cache/nvcc nvcc || echo "make: tests of what nvcc makes of our kernels skip"
-	$(VENV)/bin/python scripts/test.py
 
 check: packages $(STAMP)
 	@test -f build/cpu/build.ninja || cmake --preset cpu $(CMAKE_ARGS)
