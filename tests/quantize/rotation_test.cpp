@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 
 #include "quantize/ones.h"
 #include "quantize/rotation_places.h"
@@ -70,8 +71,9 @@ std::string in_float32(const std::string& path) {
   EditableBundle bundle = EditableBundle::read(path);
   for (EditableBundle::Piece& piece : bundle.tensors) {
     if (piece.type != DType::bf16) continue;
-    std::string floats;
-    for (std::size_t i = 0; i < piece.data.size(); i += 2) floats += std::string(2, '\0') + piece.data.substr(i, 2);
+    std::string floats(2 * piece.data.size(), '\0');
+    const char *from = piece.data.data(), *const end = from + piece.data.size();
+    for (char* to = floats.data() + 2; from != end; from += 2, to += 4) std::memcpy(to, from, 2);
     piece.type = DType::f32, piece.data = std::move(floats);
   }
   return bundle.write("float32.gguf");

@@ -54,18 +54,19 @@ inline void store(int tile, void* base, std::size_t stride) {
 }
 
 /// c += a * b, where a line of b holds a pair of numbers for every column of c: even and odd numbers are summed apart.
-inline void multiply(int c, int a, int b) {
-  const auto number = [](int tile, int line, int i) {
+VLA_UNWATCHED inline void multiply(int c, int a, int b) {
+  const auto number = [](int tile, int line, int i) VLA_UNWATCHED {
     std::uint16_t bits;
     std::memcpy(&bits, tiles[tile].line[line] + 2 * i, sizeof(bits));
-    return std::bit_cast<float>(std::uint32_t{bits} << 16);
+    return __builtin_bit_cast(float, std::uint32_t{bits} << 16);
   };
   REQUIRE(bytes(a) / 4 == static_cast<std::size_t>(lines(b)));
   REQUIRE((lines(a) == lines(c) && bytes(b) == bytes(c)));
-  for (int m = 0; m < lines(c); ++m)
-    for (int n = 0; n < static_cast<int>(bytes(c)) / 4; ++n) {
+  const int n_line = lines(c), n_column = static_cast<int>(bytes(c)) / 4, depth = lines(b);
+  for (int m = 0; m < n_line; ++m)
+    for (int n = 0; n < n_column; ++n) {
       float even = 0, odd = 0, sum;
-      for (int k = 0; k < lines(b); ++k) {
+      for (int k = 0; k < depth; ++k) {
         even = multiply_add(number(a, m, 2 * k), number(b, k, 2 * n), even);
         odd = multiply_add(number(a, m, 2 * k + 1), number(b, k, 2 * n + 1), odd);
       }
@@ -76,16 +77,16 @@ inline void multiply(int c, int a, int b) {
 }
 
 /// The same of bytes, four in a line of b for every column of c: signed in a, unsigned in b.
-inline void multiply_bytes(int c, int a, int b) {
+VLA_UNWATCHED inline void multiply_bytes(int c, int a, int b) {
   REQUIRE(bytes(a) / 4 == static_cast<std::size_t>(lines(b)));
   REQUIRE((lines(a) == lines(c) && bytes(b) == bytes(c)));
-  for (int m = 0; m < lines(c); ++m)
-    for (int n = 0; n < static_cast<int>(bytes(c)) / 4; ++n) {
+  const int n_line = lines(c), n_column = static_cast<int>(bytes(c)) / 4, depth = 4 * lines(b);
+  for (int m = 0; m < n_line; ++m)
+    for (int n = 0; n < n_column; ++n) {
       std::int32_t sum;
       std::memcpy(&sum, tiles[c].line[m] + 4 * n, sizeof(sum));
-      for (int k = 0; k < 4 * lines(b); ++k)
-        sum +=
-            static_cast<signed char>(tiles[a].line[m][k]) * std::to_integer<int>(tiles[b].line[k / 4][4 * n + k % 4]);
+      for (int k = 0; k < depth; ++k)
+        sum += static_cast<signed char>(tiles[a].line[m][k]) * static_cast<int>(tiles[b].line[k / 4][4 * n + k % 4]);
       std::memcpy(tiles[c].line[m] + 4 * n, &sum, sizeof(sum));
     }
 }
