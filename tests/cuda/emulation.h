@@ -59,8 +59,9 @@ struct Entry {
 };
 const Entry* find_entry(const char* name);
 
+/// Blocks, of which each `cluster` that follow each other in z are one cluster.
 struct Extent {
-  unsigned x, y, z;
+  unsigned x, y, z, cluster = 1;
 };
 /// Runs all blocks, one after the other. Throws Fault.
 void run_entry(const Entry& entry, Extent grid, unsigned n_thread, std::size_t shared, const void* job);

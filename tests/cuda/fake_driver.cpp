@@ -181,9 +181,10 @@ bool is_allocated(Address address, std::size_t size) {
 struct Calls {
   static int init(unsigned) { return 0; }
   static int error_name(int error, const char** name) {
-    *name = error == kOutOfMemory    ? "CUDA_ERROR_OUT_OF_MEMORY"
-            : error == kLaunchFailed ? "CUDA_ERROR_LAUNCH_FAILED"
-                                     : nullptr;
+    *name = error == kOutOfMemory      ? "CUDA_ERROR_OUT_OF_MEMORY"
+            : error == kLaunchFailed   ? "CUDA_ERROR_LAUNCH_FAILED"
+            : error == kInvalidCluster ? "CUDA_ERROR_INVALID_CLUSTER_SIZE"
+                                       : nullptr;
     return *name ? 0 : kInvalidValue;
   }
   static int error_text(int, const char** text) { return *text = "as the test wants it", 0; }
@@ -352,9 +353,11 @@ struct Calls {
     const Function* function = find(state.functions, handle);
     if (function == nullptr) return kInvalidHandle;
     const unsigned most = vla::cuda::kMaxGridYZ;
+    unsigned cluster = 1;
     if (shared > function->max_shared || block_y != 1 || block_z != 1 || extra != nullptr || x == 0 || y == 0 ||
-        z == 0 || y > most || z > most || !is_known(attributes, n_attribute))
+        z == 0 || y > most || z > most || !are_known(attributes, n_attribute, cluster))
       return kInvalidValue;
+    if (cluster == 0 || cluster > vla::cuda::kMaxCluster || z % cluster != 0) return kInvalidCluster;
     const std::size_t size = function->ptx ? function->ptx->param_size : function->entry->job_size;
     if (!state.driver.computes) return enqueue(stream, [] {});
     const auto* from = static_cast<const std::byte*>(parameters[0]);
@@ -364,7 +367,7 @@ struct Calls {
       const std::unique_ptr<std::byte[]> job(new std::byte[size]);
       std::copy(bytes.begin(), bytes.end(), job.get());
       device_memory().begin_launch();
-      const Extent grid = {x, y, z};
+      const Extent grid = {x, y, z, cluster};
       function->ptx ? run_ptx(*function->ptx, grid, n_thread, shared, job.get())
                     : run_entry(*function->entry, grid, n_thread, shared, job.get());
     });
@@ -410,10 +413,16 @@ struct Calls {
   static int executable_destroy(Handle executable) { return take_back(state.graphs, executable); }
 
  private:
-  /// Whether attributes of a launch are none, or that it may begin while the kernel before it ends, which one from
-  /// Hopper on may. Kernels of the machine run one after the other all the same.
-  static bool is_known(const vla::cuda::LaunchAttribute* attributes, unsigned n) {
-    return n == 0 || (n == 1 && attributes[0].id == 6 && state.driver.major >= 9);
+  /// Whether attributes of a launch are known: that it may begin while the kernel before it ends, and its blocks of a
+  /// cluster in z, both from Hopper on. Kernels of the machine run one after the other all the same.
+  static bool are_known(const vla::cuda::LaunchAttribute* attributes, unsigned n, unsigned& cluster) {
+    for (unsigned i = 0; i < n; ++i) {
+      const auto& [id, padding, value] = attributes[i];
+      if (state.driver.major < 9 || (id != 4 && id != 6)) return false;
+      if (id == 4 && (value[0] != (1ULL << 32 | 1) || value[1] >> 32 != 0)) return false;
+      if (id == 4) cluster = static_cast<unsigned>(value[1]);
+    }
+    return true;
   }
   /// What the compiler says, where the options ask for it: 5 the room for its errors, 6 how many bytes that has.
   static void write_log(const char* text, unsigned n_option, const int* options, void* const* values) {

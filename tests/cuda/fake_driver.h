@@ -20,7 +20,7 @@ constexpr const char* kHostModule = "host";
 
 constexpr int kInvalidValue = 1, kOutOfMemory = 2, kInvalidImage = 200, kInvalidContext = 201, kInvalidPtx = 218,
               kInvalidHandle = 400, kNotFound = 500, kLaunchFailed = 719, kCaptureUnsupported = 900,
-              kCaptureUnjoined = 904;
+              kCaptureUnjoined = 904, kInvalidCluster = 912;
 
 /// How the driver behaves, and what was asked of it.
 struct FakeDriver {

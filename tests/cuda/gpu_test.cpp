@@ -236,6 +236,34 @@ TEST_CASE("capturing refuses what no graph can hold, and a stream that is not wa
   CHECK(main->wait());
 }
 
+TEST_CASE("a launch in clusters is asked of a Hopper, and refused where it is not one or has no such cluster") {
+  const auto refusal = [](unsigned cluster, unsigned z, int major) {
+    reset_fake_driver();
+    fake_driver().major = major;
+    auto gpu = Gpu::open(fake_driver_table(), 0, modules_of_tests());
+    REQUIRE(gpu);
+    auto stream = (*gpu)->stream();
+    auto memory = (*gpu)->allocate(64, "memory");
+    MapJob job = {};
+    job.a = memory->as<float>(), job.y = memory->as<float>();
+    Launch how = {"map_elements", {1, 1, z}, 32};
+    for (int i = 0; i < 2; ++i) {  // the second one may begin before the first ends
+      how.cluster = i == 0 ? 1 : cluster;
+      const Status status = stream->launch(how, job);
+      if (!status) return status.error().message();
+    }
+    return std::string();
+  };
+  constexpr const char* kInvalid = "cuda launch: CUDA_ERROR_INVALID_CLUSTER_SIZE, as the test wants it";
+  CHECK(refusal(1, 3, 9).empty());
+  CHECK(refusal(2, 4, 9).empty());
+  CHECK(refusal(8, 8, 9).empty());
+  CHECK(refusal(9, 9, 9) == kInvalid);
+  CHECK(refusal(2, 3, 9) == kInvalid);
+  CHECK(refusal(2, 4, 12) == "map_elements: expected a Hopper, found a cluster elsewhere");
+  reset_fake_driver();
+}
+
 TEST_CASE("a kernel that fails loses the device, for every later call") {
   reset_fake_driver();
   auto gpu = Gpu::open(fake_driver_table(), 0, modules_of_tests());

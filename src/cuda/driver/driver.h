@@ -14,7 +14,7 @@ namespace vla::cuda {
 using Address = std::uint64_t;  // CUdeviceptr
 using Handle = void*;           // a context, stream, event, module, function or graph
 
-/// CUlaunchAttribute. An int value is stored in the first bytes of `value`.
+/// CUlaunchAttribute. An int value, or a cluster's three sizes of 4 bytes, are stored in the first bytes of `value`.
 struct LaunchAttribute {
   int id, padding;
   std::uint64_t value[8];

@@ -16,7 +16,7 @@ constexpr int kOutOfMemory = 2, kInvalidImage = 200, kNoBinary = 209;
 constexpr int kCapabilityMajor = 75, kCapabilityMinor = 76, kCountSm = 16, kMaxDynamicShared = 8;
 constexpr unsigned kNonBlocking = 1, kNoTiming = 2;
 constexpr int kThreadLocal = 1;
-constexpr int kOverlaps = 6;                     // attribute of a launch: programmatic stream serialization
+constexpr int kCluster = 4, kOverlaps = 6;       // attributes of a launch: cluster, programmatic stream serialization
 constexpr int kErrorLog = 5, kErrorLogSize = 6;  // options of module_load
 
 std::string version_text(int version) {
@@ -283,9 +283,13 @@ Status Stream::note_time(const Owned& event) {
 
 Status Stream::launch_job(const Launch& how, const void* job) {
   VLA_TRY(Handle function, gpu_->kernel(how));
+  if (how.cluster > 1 && !gpu_->is_hopper())
+    return Error{Code::internal, how.kernel, "a Hopper", "a cluster elsewhere"};
   void* parameters[] = {const_cast<void*>(job)};  // the driver copies the job
-  LaunchAttribute overlaps = {kOverlaps, 0, {1}};
-  const bool may_overlap = follows_kernel_ && gpu_->capability_ >= 90;
+  LaunchAttribute attributes[2] = {};
+  unsigned n_attribute = 0;
+  if (follows_kernel_ && gpu_->capability_ >= 90) attributes[n_attribute++] = {kOverlaps, 0, {1}};
+  if (how.cluster > 1) attributes[n_attribute++] = {kCluster, 0, {std::uint64_t{1} << 32 | 1, how.cluster}};
   const LaunchConfig config = {.grid_x = how.grid.x,
                                .grid_y = how.grid.y,
                                .grid_z = how.grid.z,
@@ -294,8 +298,8 @@ Status Stream::launch_job(const Launch& how, const void* job) {
                                .block_z = 1,
                                .shared = how.shared,
                                .stream = stream_.get(),
-                               .attributes = &overlaps,
-                               .n_attribute = may_overlap ? 1U : 0U};
+                               .attributes = attributes,
+                               .n_attribute = n_attribute};
   follows_kernel_ = true;
   return CALL(launch, &config, function, parameters, nullptr);
 }

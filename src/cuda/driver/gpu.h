@@ -66,7 +66,8 @@ class Stream {
     return launch_job(how, &job);
   }
   /// Launches a kernel; `job` points to its parameter. From Hopper on, the kernel may begin before the stream's
-  /// previous kernel ends, and waits for the previous kernel's results itself (device.h, wait_for_earlier).
+  /// previous kernel ends, and waits for the previous kernel's results itself (device.h, wait_for_earlier). Errors:
+  /// internal for a cluster on another device than a Hopper.
   Status launch_job(const Launch& how, const void* job);
   /// Waits until all operations are done.
   Status wait();

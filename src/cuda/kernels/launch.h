@@ -16,7 +16,8 @@ struct Launch {
   const char* kernel;
   Grid grid;
   unsigned n_thread;
-  unsigned shared = 0;  // bytes of dynamic shared memory
+  unsigned shared = 0;   // bytes of dynamic shared memory
+  unsigned cluster = 1;  // blocks that follow each other in z and form a cluster; more than one only on Hopper
 };
 
 /// Marks functions that kernels and host code share.
@@ -30,6 +31,8 @@ struct Launch {
 constexpr unsigned kMaxShared = 99 << 10;
 /// The same on Hopper.
 constexpr unsigned kHopperShared = 227 << 10;
+/// Most blocks of a cluster on every Hopper.
+constexpr unsigned kMaxCluster = 8;
 /// Most blocks of a grid in y and z.
 constexpr unsigned kMaxGridYZ = 65535;
 
