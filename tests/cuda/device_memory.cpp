@@ -69,13 +69,13 @@ bool DeviceMemory::has_result(const Allocation& in, std::uintptr_t p, std::size_
 void DeviceMemory::check_race(Allocation& in, std::uintptr_t p, std::size_t size, bool writes) {
   for (std::size_t word = (p - in.first) / 4, end = word + size / 4; word < end; ++word) {
     const std::uint32_t writer = in.writer[word], reader = in.reader[word];
-    if (writer >= launch_ && writer != block_) throw Fault("two blocks of a launch touch what one of them writes");
+    if (writer >= launch_ && writer != current_) throw Fault("two blocks of a launch touch what one of them writes");
     if (!writes) {
-      in.reader[word] = block_;
+      in.reader[word] = current_;
       continue;
     }
-    if (reader >= launch_ && reader != block_) throw Fault("two blocks of a launch touch what one of them writes");
-    in.writer[word] = block_;
+    if (reader >= launch_ && reader != current_) throw Fault("two blocks of a launch touch what one of them writes");
+    in.writer[word] = current_;
   }
 }
 

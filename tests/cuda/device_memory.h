@@ -33,7 +33,10 @@ class DeviceMemory {
   std::size_t n_allocation() const { return all_.size(); }
 
   void begin_launch() { launch_ = block_ + 1; }
-  void begin_block() { ++block_; }
+  /// The number of a block that begins.
+  std::uint32_t begin_block() { return ++block_; }
+  /// What follows is done by a block that has begun.
+  void go_on(std::uint32_t block) { current_ = block; }
   /// Whether a kernel has written any word of [p, p + size).
   static bool has_result(const Allocation& in, std::uintptr_t p, std::size_t size);
   /// Checks an access and tells in which allocation it is; `hint` may be where the last one was, or null.
@@ -42,8 +45,8 @@ class DeviceMemory {
  private:
   void check_race(Allocation& in, std::uintptr_t p, std::size_t size, bool writes);
 
-  std::map<std::uintptr_t, Allocation> all_;  // by the end
-  std::uint32_t block_ = 0, launch_ = 0;
+  std::map<std::uintptr_t, Allocation> all_;            // by the end
+  std::uint32_t block_ = 0, launch_ = 0, current_ = 0;  // block_: the last that began
 };
 
 /// The only device.

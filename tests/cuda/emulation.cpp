@@ -25,9 +25,11 @@ std::map<std::string, const Entry*>& entries() {
   return all;
 }
 
+struct Block;
 struct Thread {
   Fiber fiber;
   int number = 0;
+  Block* block = nullptr;
 };
 /// Sums of wgmma, and where each lane has them.
 struct Sums : WgmmaSums {
@@ -39,85 +41,117 @@ struct Warp {
   Wgmma wgmma = {};
   std::list<Sums> sums = {};  // in flight
 };
-/// The block that runs.
+/// A block of the cluster that runs.
 struct Block {
   std::vector<std::unique_ptr<Thread>> threads;
   std::vector<Warp> warps;
-  std::vector<Thread*> ready;  // the last one goes on first, so that a warp runs until it waits for another
   std::vector<Thread*> at_barrier;
   SharedMemory shared;
+  unsigned z = 0;
+  std::size_t n_done = 0;
+};
+/// The cluster that runs; most have one block.
+struct Cluster {
+  std::vector<std::unique_ptr<Block>> blocks;  // the first n_block of them run
+  std::size_t n_block = 0, n_thread = 0, n_done = 0;
+  std::vector<Thread*> ready;  // the last one goes on first, so that a warp runs until it waits for another
+  std::vector<Thread*> at_barrier;
+  bool releases = true;  // that barrier
   Fiber main;
   Thread* self = nullptr;
-  int n_done = 0;
   std::minstd_rand random;
   const Entry* entry = nullptr;
   const void* job = nullptr;
   std::string fault;
-
-  Warp& warp() { return warps[static_cast<std::size_t>(self->number / kWarp)]; }
 };
-Block block;
+Cluster cluster;
+
+Block& own_block() { return *cluster.self->block; }
+Warp& own_warp() { return own_block().warps[static_cast<std::size_t>(cluster.self->number / kWarp)]; }
 
 /// Another thread goes on, or the launch where none can.
 void go_on(Fiber& from) {
-  if (block.ready.empty() && block.fault.empty() && block.n_done < static_cast<int>(block.threads.size()))
-    block.fault = "every thread waits: some came to another barrier or instruction of a warp, or ended";
-  if (block.ready.empty() || !block.fault.empty()) {
-    if (&from != &block.main) from.switch_to(block.main);
+  if (cluster.ready.empty() && cluster.fault.empty() && cluster.n_done < cluster.n_thread)
+    cluster.fault = cluster.at_barrier.empty()
+                        ? "every thread waits: some came to another barrier or instruction of a warp, or ended"
+                        : "some threads wait at a barrier of the cluster, others elsewhere, or they ended";
+  if (cluster.ready.empty() || !cluster.fault.empty()) {
+    if (&from != &cluster.main) from.switch_to(cluster.main);
     return;
   }
-  Thread* next = block.ready.back();
-  block.ready.pop_back();
-  block.self = next;
-  threadIdx.x = static_cast<unsigned>(next->number);
+  Thread* next = cluster.ready.back();
+  cluster.ready.pop_back();
+  cluster.self = next;
+  threadIdx.x = static_cast<unsigned>(next->number), blockIdx.z = next->block->z;
   if (&next->fiber != &from) from.switch_to(next->fiber);
 }
 
 void release(std::vector<Thread*> threads) {
-  if (schedule.seed) std::shuffle(threads.begin(), threads.end(), block.random);
-  block.ready.insert(block.ready.end(), threads.rbegin(), threads.rend());
+  if (schedule.seed) std::shuffle(threads.begin(), threads.end(), cluster.random);
+  cluster.ready.insert(cluster.ready.end(), threads.rbegin(), threads.rend());
 }
 
 void thread_main() {
-  Thread& self = *block.self;
+  Thread& self = *cluster.self;
   self.fiber.arrived();
   try {
-    block.entry->run(block.job);
-    block.warp().wgmma.end();
+    cluster.entry->run(cluster.job);
+    own_warp().wgmma.end();
+    if (++self.block->n_done == self.block->threads.size()) self.block->shared.end();
   } catch (const Fault& problem) {
-    if (block.fault.empty()) block.fault = problem.what();
+    if (cluster.fault.empty()) cluster.fault = problem.what();
   }
-  ++block.n_done;
+  ++cluster.n_done;
   go_on(self.fiber);
   std::abort();  // nobody comes back here
 }
 
-void run_block(int n_thread, std::size_t shared) {
+/// Begins a block, whose threads join `all`.
+void begin_block(Block& block, unsigned z, int n_thread, std::size_t shared, std::vector<Thread*>& all) {
   const auto n = static_cast<std::size_t>(n_thread);
   while (block.threads.size() < n) block.threads.push_back(std::make_unique<Thread>());
   block.threads.resize(n);
   block.warps.clear();
   block.warps.resize(n / kWarp);
-  block.ready.clear(), block.at_barrier.clear(), block.fault.clear();
-  block.n_done = 0;
+  block.at_barrier.clear();
+  block.z = z, block.n_done = 0;
   block.shared.begin(shared, n_thread);
   for (std::size_t i = 0; i < block.warps.size(); ++i) block.warps[i].wgmma.begin(block.shared, static_cast<int>(i));
-  std::vector<Thread*> all;
   for (std::size_t i = 0; i < n; ++i) {
-    block.threads[i]->number = static_cast<int>(i);
+    block.threads[i]->number = static_cast<int>(i), block.threads[i]->block = &block;
     block.threads[i]->fiber.begin(thread_main);
     all.push_back(block.threads[i].get());
   }
+}
+
+/// Runs the blocks from z on that are a cluster.
+void run_cluster(unsigned z, std::size_t n_block, int n_thread, std::size_t shared) {
+  while (cluster.blocks.size() < n_block) cluster.blocks.push_back(std::make_unique<Block>());
+  cluster.ready.clear(), cluster.at_barrier.clear(), cluster.fault.clear();
+  std::vector<Thread*> all;
+  for (std::size_t i = 0; i < n_block; ++i)
+    begin_block(*cluster.blocks[i], z + static_cast<unsigned>(i), n_thread, shared, all);
+  cluster.n_block = n_block, cluster.n_thread = all.size(), cluster.n_done = 0;
   release(all);
-  go_on(block.main);
-  if (block.fault.empty()) {
+  go_on(cluster.main);
+  if (!cluster.fault.empty())
+    throw Fault(std::string(cluster.entry->name) + ", block " + std::to_string(blockIdx.x) + "," +
+                std::to_string(blockIdx.y) + "," + std::to_string(blockIdx.z) + ", thread " +
+                std::to_string(threadIdx.x) + ": " + cluster.fault);
+  for (std::size_t i = 0; i < n_block; ++i) {
     std::vector<const Wgmma*> warps;
-    for (const Warp& warp : block.warps) warps.push_back(&warp.wgmma);
-    return check_warpgroups(warps);
+    for (const Warp& warp : cluster.blocks[i]->warps) warps.push_back(&warp.wgmma);
+    check_warpgroups(warps);
   }
-  throw Fault(std::string(block.entry->name) + ", block " + std::to_string(blockIdx.x) + "," +
-              std::to_string(blockIdx.y) + "," + std::to_string(blockIdx.z) + ", thread " +
-              std::to_string(threadIdx.x) + ": " + block.fault);
+}
+
+bool comes_before(const Thread* a, const Thread* b) {
+  return std::pair(a->block->z, a->number) < std::pair(b->block->z, b->number);
+}
+/// All that have come to a barrier go on.
+void go_through(std::vector<Thread*>& at_barrier) {
+  std::sort(at_barrier.begin(), at_barrier.end(), comes_before);
+  release(std::exchange(at_barrier, {}));
 }
 
 }  // namespace
@@ -135,44 +169,60 @@ void run_entry(const Entry& entry, Extent grid, unsigned n_thread, std::size_t s
   if (n_thread % kWarp != 0 || static_cast<int>(n_thread) > entry.max_thread)
     throw Fault(std::string(entry.name) + ": " + std::to_string(n_thread) +
                 " threads are not whole warps, or too many");
-  block.entry = &entry, block.job = job;
-  block.random.seed(schedule.seed);
+  cluster.entry = &entry, cluster.job = job;
+  cluster.random.seed(schedule.seed);
   gridDim = {grid.x, grid.y, grid.z}, blockDim = {n_thread, 1, 1};
-  for (blockIdx.z = 0; blockIdx.z < grid.z; ++blockIdx.z)
+  for (unsigned z = 0; z < grid.z; z += grid.cluster)
     for (blockIdx.y = 0; blockIdx.y < grid.y; ++blockIdx.y)
-      for (blockIdx.x = 0; blockIdx.x < grid.x; ++blockIdx.x) run_block(static_cast<int>(n_thread), shared);
+      for (blockIdx.x = 0; blockIdx.x < grid.x; ++blockIdx.x)
+        run_cluster(z, grid.cluster, static_cast<int>(n_thread), shared);
 }
 
 void fault(const char* what) { throw Fault(what); }
 
 void barrier() {
-  if (block.self->number == 0) ++counts.barriers;
-  block.at_barrier.push_back(block.self);
-  if (block.at_barrier.size() == block.threads.size()) {
-    block.shared.barrier();
-    std::sort(block.at_barrier.begin(), block.at_barrier.end(), [](auto* a, auto* b) { return a->number < b->number; });
-    release(std::move(block.at_barrier));
-    block.at_barrier.clear();
-  }
-  go_on(block.self->fiber);
+  Block& block = own_block();
+  if (cluster.self->number == 0) ++counts.barriers;
+  block.at_barrier.push_back(cluster.self);
+  if (block.at_barrier.size() == block.threads.size()) block.shared.barrier(), go_through(block.at_barrier);
+  go_on(cluster.self->fiber);
 }
 
-std::byte* shared_memory() { return block.shared.data(); }
-int lane_index() { return block.self->number % kWarp; }
+void cluster_barrier(bool releases) {
+  cluster.releases = releases && (cluster.releases || cluster.at_barrier.empty());
+  cluster.at_barrier.push_back(cluster.self);
+  if (cluster.at_barrier.size() == cluster.n_thread) {
+    for (std::size_t i = 0; i < cluster.n_block; ++i) cluster.blocks[i]->shared.cluster_barrier(cluster.releases);
+    go_through(cluster.at_barrier);
+  }
+  go_on(cluster.self->fiber);
+}
+
+std::byte* shared_memory() { return own_block().shared.data(); }
+int lane_index() { return cluster.self->number % kWarp; }
 
 void check_shared(const std::byte* p, std::size_t size, bool writes) {
-  const std::size_t at = block.shared.offset(p);
-  writes ? block.shared.write(at, size, block.self->number) : block.shared.read(at, size, block.self->number);
+  SharedMemory& shared = own_block().shared;
+  const std::size_t at = shared.offset(p);
+  writes ? shared.write(at, size, cluster.self->number) : shared.read(at, size, cluster.self->number);
+}
+const std::byte* of_block(const std::byte* p, std::size_t size, int rank) {
+  if (rank < 0 || static_cast<std::size_t>(rank) >= cluster.n_block) fault("the cluster has no such block");
+  Block &own = own_block(), &other = *cluster.blocks[static_cast<std::size_t>(rank)];
+  const std::size_t at = own.shared.offset(p);
+  &own == &other ? own.shared.read(at, size, cluster.self->number) : other.shared.read_by_other(at, size);
+  return other.shared.data() + at;
 }
 void copy_async(std::byte* to, const void* from, std::size_t size) {
   if (reinterpret_cast<std::uintptr_t>(from) % 16 != 0) fault("source of an asynchronous copy is not aligned");
-  block.shared.copy(block.shared.offset(to), from, size, block.self->number);
+  SharedMemory& shared = own_block().shared;
+  shared.copy(shared.offset(to), from, size, cluster.self->number);
 }
-void commit_copies() { block.shared.commit(block.self->number); }
-void wait_copies(std::size_t n_left) { block.shared.wait(n_left, block.self->number); }
+void commit_copies() { own_block().shared.commit(cluster.self->number); }
+void wait_copies(std::size_t n_left) { own_block().shared.wait(n_left, cluster.self->number); }
 
-unsigned shared_address(const std::byte* p) { return static_cast<unsigned>(block.shared.offset(p)); }
-void fence_async_proxy() { block.shared.fence_async(block.self->number); }
+unsigned shared_address(const std::byte* p) { return static_cast<unsigned>(own_block().shared.offset(p)); }
+void fence_async_proxy() { own_block().shared.fence_async(cluster.self->number); }
 
 namespace {
 
@@ -206,6 +256,7 @@ struct Registers {
 };
 
 void compute(Meeting* const* lanes, int warp) {
+  Block& block = own_block();
   Warp& of = block.warps[static_cast<std::size_t>(warp)];
   Lanes to[4], sum[4];
   const auto results = [&] {
@@ -251,8 +302,9 @@ void compute(Meeting* const* lanes, int warp) {
 }  // namespace
 
 void meet(Meeting& mine) {
-  Warp& warp = block.warp();
-  const int lane = lane_index(), first = block.self->number - lane;
+  Block& block = own_block();
+  Warp& warp = own_warp();
+  const int lane = lane_index(), first = cluster.self->number - lane;
   for (const Meeting* other : warp.lanes)
     if (other != nullptr && other->kind != mine.kind) fault("lanes of a warp came to different instructions");
   warp.lanes[lane] = &mine;
@@ -265,7 +317,7 @@ void meet(Meeting& mine) {
     for (int l = 0; l < kWarp; ++l) all.push_back(block.threads[static_cast<std::size_t>(first + l)].get());
     release(std::move(all));
   }
-  go_on(block.self->fiber);
+  go_on(cluster.self->fiber);
 }
 
 }  // namespace vla::test::cuda

@@ -63,15 +63,18 @@ const Entry* find_entry(const char* name);
 struct Extent {
   unsigned x, y, z, cluster = 1;
 };
-/// Runs all blocks, one after the other. Throws Fault.
+/// Runs all clusters, one after the other. Throws Fault.
 void run_entry(const Entry& entry, Extent grid, unsigned n_thread, std::size_t shared, const void* job);
 
 // What kernels call.
 
 [[noreturn]] void fault(const char* what);
 void barrier();
+void cluster_barrier(bool releases);
 std::byte* shared_memory();
 void check_shared(const std::byte* p, std::size_t size, bool writes);
+/// Where a block of the cluster has what this block has at p, to read it.
+const std::byte* of_block(const std::byte* p, std::size_t size, int rank);
 void copy_async(std::byte* to, const void* from, std::size_t size);
 void commit_copies();
 void wait_copies(std::size_t n_left);
@@ -133,6 +136,13 @@ inline void copy_async(std::byte* to, const void* from, int size) {
 template <int kLeft>
 void wait_copies() {
   test::cuda::wait_copies(kLeft);
+}
+inline void meet_cluster() { test::cuda::cluster_barrier(true); }
+inline void leave_cluster() { test::cuda::cluster_barrier(false); }
+inline uint4 read_of_block(const std::byte* p, int rank) {
+  uint4 value;
+  std::memcpy(&value, test::cuda::of_block(p, sizeof(value), rank), sizeof(value));
+  return value;
 }
 inline void load_matrices(unsigned (&to)[4], const std::byte* from) {
   test::cuda::Meeting mine = {test::cuda::Meeting::kMatrices, nullptr, nullptr, to, from};

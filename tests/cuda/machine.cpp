@@ -57,8 +57,10 @@ void launch(const vla::cuda::Launch& how, const void* job, std::size_t job_size)
     refuse("more blocks in y or z than a grid may have");
   if (how.shared > (name.starts_with("hopper_") ? vla::cuda::kHopperShared : vla::cuda::kMaxShared))
     refuse("more shared memory than every device has");
+  if (how.cluster == 0 || how.cluster > vla::cuda::kMaxCluster || grid.z % how.cluster != 0)
+    refuse("a cluster that no device has, or that does not divide the grid");
   device_memory().begin_launch();
-  const Extent extent = {grid.x, grid.y, grid.z};
+  const Extent extent = {grid.x, grid.y, grid.z, how.cluster};
   for (const PtxModule& module : modules())
     if (const PtxKernel* kernel = module.find(name)) {
       if (kernel->param_size != job_size) refuse("a job of another size");

@@ -2,10 +2,31 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Kernels that do what none may, for machine_test.cpp.
-#include "cuda/kernels/device.h"
+#include "cuda/kernels/hopper.h"
 #include "cuda/machine_kernels.h"
 
 namespace vla::cuda {
+
+/// Each block writes its threads' numbers and reads the other one's.
+VLA_DEVICE int misbehave_in_cluster(test::cuda::Mistake mistake) {
+  using test::cuda::Mistake;
+  std::byte* own = dev::shared_memory() + thread_index() * 16;
+  const int rank = static_cast<int>(blockIdx.z), other = mistake == Mistake::no_such_block ? 2 : 1 - rank;
+  const auto write = [&](int number) { dev::write(own, uint4{static_cast<unsigned>(number), 0, 0, 0}); };
+  if (mistake != Mistake::write_after_barrier) write(rank * 100 + thread_index());
+  if (mistake == Mistake::barrier_of_block)
+    __syncthreads();
+  else if (mistake == Mistake::barrier_releases_nothing)
+    dev::leave_cluster();
+  else if (mistake != Mistake::no_cluster_barrier)
+    dev::meet_cluster();
+  if (mistake == Mistake::write_after_barrier) write(0);
+  const auto read = static_cast<int>(dev::read_of_block(own, other).x);
+  if (mistake == Mistake::write_of_what_is_read) write(0);
+  if (mistake == Mistake::some_threads_leave && thread_index() == 5) return read;
+  if (mistake != Mistake::read_of_ended_block) dev::leave_cluster();
+  return read;
+}
 
 VLA_KERNEL(misbehave, 64, 1, MisbehaveJob) {
   using test::cuda::Mistake;
@@ -57,8 +78,10 @@ VLA_KERNEL(misbehave, 64, 1, MisbehaveJob) {
       sum = lane < 16 ? dev::shuffle_xor(thread, 1) : sum;
       if (lane >= 16) __syncwarp();
       break;
+    default:
+      sum = misbehave_in_cluster(job.mistake);
   }
-  job.y[static_cast<int>(blockIdx.x) * 64 + thread] = sum;
+  job.y[static_cast<int>(blockIdx.x + blockIdx.z) * 64 + thread] = sum;
 }
 
 }  // namespace vla::cuda

@@ -16,6 +16,16 @@ enum class Mistake {
   some_lanes_shuffle,
   some_warps_wait,
   different_instructions,
+  // In clusters of two blocks.
+  no_mistake_of_cluster,
+  no_cluster_barrier,
+  barrier_of_block,
+  barrier_releases_nothing,
+  write_after_barrier,
+  write_of_what_is_read,
+  read_of_ended_block,
+  some_threads_leave,
+  no_such_block,
 };
 
 }  // namespace vla::test::cuda

@@ -37,13 +37,16 @@ std::string kernel_of(const std::string& body) {
          "%rd2;\n" +
          body + "\nret;\n}\n";
 }
-std::vector<std::uint32_t> run_body(const std::string& body, unsigned n_thread = 32, unsigned n_block = 1) {
+std::vector<std::uint32_t> run_body(const std::string& body, unsigned n_thread, Extent grid) {
   const PtxModule module(kernel_of(body));
   const Device<std::uint32_t> y(64);
   std::uint32_t* p = y.get();
   device_memory().begin_launch();
-  run_ptx(*module.find("k"), {n_block, 1, 1}, n_thread, 512, &p);
+  run_ptx(*module.find("k"), grid, n_thread, 512, &p);
   return y.host();
+}
+std::vector<std::uint32_t> run_body(const std::string& body, unsigned n_thread = 32, unsigned n_block = 1) {
+  return run_body(body, n_thread, {n_block, 1, 1});
 }
 std::string fault_of_body(const std::string& body, unsigned n_thread = 32, unsigned n_block = 1) {
   return fault_of([&] { run_body(body, n_thread, n_block); });
@@ -74,6 +77,28 @@ TEST_CASE("each mistake of a kernel is a fault that says what is wrong, and thre
   });
 }
 
+TEST_CASE("each mistake of blocks of a cluster is a fault that says what is wrong, in any order of their threads") {
+  if (runs_ptx()) return;
+  const Device<int> x(4), y(128);
+  const auto fault = [&](Mistake mistake) {
+    const vla::cuda::MisbehaveJob job = {mistake, x.get(), y.get()};
+    return fault_of([&] { launch({"misbehave", {1, 1, 2}, 64, 1024, 2}, job); });
+  };
+  in_every_schedule([&] {
+    CHECK(fault(Mistake::no_mistake_of_cluster).empty());
+    for (int i = 0; i < 128; ++i) REQUIRE(y.host()[static_cast<std::size_t>(i)] == (i < 64 ? 100 + i : i - 64));
+    CHECK(contains(fault(Mistake::no_cluster_barrier), "before a barrier of the cluster"));
+    CHECK(contains(fault(Mistake::barrier_of_block), "before a barrier of the cluster"));
+    CHECK(contains(fault(Mistake::barrier_releases_nothing), "before a barrier of the cluster"));
+    CHECK(contains(fault(Mistake::write_after_barrier), "race in shared memory"));
+    CHECK(contains(fault(Mistake::write_of_what_is_read), "race in shared memory"));
+    CHECK(contains(fault(Mistake::read_of_ended_block), "ended") !=
+          contains(fault(Mistake::read_of_ended_block), "ends while another block"));
+    CHECK(contains(fault(Mistake::some_threads_leave), "wait at a barrier of the cluster"));
+    CHECK(contains(fault(Mistake::no_such_block), "no such block"));
+  });
+}
+
 TEST_CASE("a launch that a device would refuse is refused") {
   if (runs_ptx()) return;
   const int job = 0;
@@ -83,6 +108,8 @@ TEST_CASE("a launch that a device would refuse is refused") {
   CHECK(contains(fault({"misbehave", {0, 1, 1}, 32, 0}), "without blocks"));
   CHECK(contains(fault({"misbehave", {1, 65536, 1}, 32, 0}), "more blocks"));
   CHECK(contains(fault({"misbehave", {}, 32, 100 << 10}), "more shared memory"));
+  CHECK(contains(fault({"misbehave", {1, 1, 3}, 32, 0, 2}), "does not divide the grid"));
+  CHECK(contains(fault({"misbehave", {1, 1, 9}, 32, 0, 9}), "a cluster that no device has"));
 }
 
 TEST_CASE("PTX that is not known is refused by name when it is read") {
@@ -90,6 +117,8 @@ TEST_CASE("PTX that is not known is refused by name when it is read") {
   CHECK(contains(refused("bfind.u32 %r2, %r1;"), "unknown instruction bfind.u32"));
   CHECK(contains(refused("ld.local.u32 %r2, [%rd1];"), "unknown instruction ld.local.u32"));
   CHECK(contains(refused("atom.global.add.u32 %r2, [%rd1], %r1;"), "unknown instruction atom.global.add.u32"));
+  CHECK(contains(refused("st.shared::cluster.u32 [%r1], %r2;"), "unknown instruction st.shared::cluster.u32"));
+  CHECK(contains(refused("barrier.cluster.arrive;"), "unknown instruction barrier.cluster.arrive"));
   CHECK(contains(refused("add.s32 %r2, %r1;"), "number of operands"));
   CHECK(contains(refused("add.s32 %r2, %r1, %rd1;"), "%rd1 is no register of the operation's type"));
   CHECK(contains(refused("add.s32 %r2, %r1, %r99;"), "unknown register %r99"));
@@ -144,6 +173,52 @@ TEST_CASE("PTX: races in shared memory, and barriers that some miss") {
   CHECK(contains(fault_of_body(copy + "ld.shared.u32 %r4, [%r2];"), "has not brought"));
   CHECK(contains(fault_of_body(copy + "cp.async.wait_group 1;\nld.shared.u32 %r4, [%r2];"), "has not brought"));
   CHECK(fault_of_body(copy + "cp.async.wait_group 0;\nld.shared.u32 %r4, [%r2];").empty());
+}
+
+TEST_CASE("PTX: blocks of a cluster read each other's shared memory between its barriers alone") {
+  // %r2: where a thread writes its number plus 100 %r5; %r6: the same in the other block; %rd3: its word of y.
+  const std::string begin =
+      "mov.u32 %r8, room;\nshl.b32 %r2, %r1, 4;\nadd.s32 %r2, %r2, %r8;\nmov.u32 %r5, %ctaid.z;\n"
+      "xor.b32 %r4, %r5, 1;\nmad.lo.s32 %r7, %r5, 100, %r1;\nmapa.shared::cluster.u32 %r6, %r2, %r4;\n"
+      "mul.wide.u32 %rd4, %r5, 128;\nadd.s64 %rd3, %rd3, %rd4;\n";
+  const std::string write = "st.shared.u32 [%r2], %r7;\n", read = "ld.shared::cluster.u32 %r3, [%r6];\n",
+                    store = "st.global.u32 [%rd3], %r3;\n", wait = "barrier.cluster.wait.acquire.aligned;\n",
+                    meet = "barrier.cluster.arrive.release.aligned;\n" + wait,
+                    leave = "barrier.cluster.arrive.relaxed.aligned;\n" + wait;
+  const auto run = [&](const std::string& body, unsigned n_thread = 32) {
+    return run_body(begin + body, n_thread, {1, 1, 2, 2});
+  };
+  const auto fault = [&](const std::string& body, unsigned n_thread = 32) {
+    return fault_of([&] { run(body, n_thread); });
+  };
+  in_every_schedule([&] {
+    const std::vector<std::uint32_t> y = run(write + meet + read + leave + store);
+    for (std::uint32_t i = 0; i < 64; ++i) REQUIRE(y[i] == (i < 32 ? 100 + i : i - 32));
+    const std::vector<std::uint32_t> four =
+        run("st.shared.v4.u32 [%r2], {%r5, %r1, %r7, %r7};\n" + meet +
+            "ld.shared::cluster.v4.u32 {%r3, %r4, %r3, %r9}, [%r6];\n" + leave + store);
+    CHECK(four == y);
+    CHECK(contains(fault(write + read + leave), "before a barrier of the cluster"));
+    CHECK(contains(fault(write + "bar.sync 0;\n" + read + leave), "before a barrier of the cluster"));
+    CHECK(contains(fault(write + leave + read + leave), "before a barrier of the cluster"));
+    CHECK(contains(fault(meet + write + read + leave), "race in shared memory"));
+    CHECK(contains(fault(write + meet + read + write + leave), "race in shared memory"));
+    CHECK(fault(write + meet + read + meet + write).empty());
+    CHECK(contains(fault(write + meet + read + leave + write), "race in shared memory"));
+    CHECK(!fault(write + meet + read + store).empty());  // one ends first: before it is read, or after
+    CHECK(contains(fault(write + meet + "setp.eq.s32 %p1, %r5, 1;\n@%p1 bra $end;\n" + leave + "$end:"),
+                   "some blocks end while others wait at a barrier of the cluster"));
+    CHECK(contains(fault("setp.lt.s32 %p1, %r1, 32;\n@%p1 bra $end;\n" + meet + "$end:", 64), "wait at a barrier"));
+    CHECK(contains(
+        fault("setp.lt.s32 %p1, %r1, 32;\n@%p1 bra $other;\n" + meet + "bra $end;\n$other:\n" + "bar.sync 0;\n$end:",
+              64),
+        "different barriers"));
+  });
+  CHECK(contains(fault("barrier.cluster.arrive.release.aligned;\n" + read + wait), "does not wait there"));
+  CHECK(contains(fault(wait), "the other way round"));
+  CHECK(contains(fault(meet + "ld.shared::cluster.u32 %r3, [%r2];\n" + leave), "mapa has not made"));
+  CHECK(contains(fault("mov.u32 %r4, 2;\nmapa.shared::cluster.u32 %r6, %r2, %r4;\n"), "no such block"));
+  CHECK(contains(fault(write + meet + "ld.shared::cluster.u32 %r3, [%r6+512];\n"), "not in shared memory"));
 }
 
 TEST_CASE("PTX: products of a warpgroup whose operands or sums are not ready, or touched too early") {

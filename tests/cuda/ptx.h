@@ -22,7 +22,7 @@ struct WarpState;
 /// One instruction. Operands are places in a warp's registers, which hold 32 lanes each: of 4 bytes, of 8, or one mask
 /// of 4 bytes where the register is a predicate.
 struct PtxInstruction {
-  enum Kind { kPlain, kBranch, kReturn, kBarrier, kWarp } kind = kPlain;  // kWarp: all lanes together
+  enum Kind { kPlain, kBranch, kReturn, kBarrier, kCluster, kWarp } kind = kPlain;  // kWarp: all lanes together
   void (*run)(WarpState&, const PtxInstruction&) = nullptr;
   std::uint32_t operand[16] = {};
   int n_operand = 0;
@@ -69,7 +69,7 @@ class PtxModule {
   std::map<std::string, PtxKernel> kernels_;
 };
 
-/// Runs all blocks, one after the other. Throws Fault.
+/// Runs all clusters, one after the other, and the blocks of a cluster in turns. Throws Fault.
 void run_ptx(const PtxKernel& kernel, Extent grid, unsigned n_thread, std::size_t shared, const void* job);
 
 // Between ptx_parse.cpp and ptx_instructions.cpp.
@@ -88,7 +88,7 @@ struct PtxOperation {
 const PtxOperation* find_operation(const std::string& name);
 /// The product of a wgmma, and what runs it; null for others.
 void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, const PtxInstruction&);
-/// Loads (ld) and stores (st) of param, shared and global; null for others.
+/// Loads (ld) and stores (st) of param, shared and global, and loads of shared::cluster; null for others.
 void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&);
 
 }  // namespace vla::test::cuda

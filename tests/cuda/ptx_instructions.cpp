@@ -151,6 +151,30 @@ void access_shared(WarpState& w, const PtxInstruction& i) {
   });
   SharedMemory::count_conflicts(offsets, size);
 }
+/// An address in a cluster's shared memory: a block's rank, plus 1, above what is an address in a block's own.
+constexpr int kRankAt = 24;
+void map_to_block(WarpState& w, const PtxInstruction& i) {
+  const u32 *address = w.lanes<u32>(i.operand[1]), *rank = w.lanes<u32>(i.operand[2]);
+  each_lane(w.active, [&](int l) {
+    if (rank[l] >= w.cluster.size()) fault_at(w, i, l, "the cluster has no such block");
+    if (address[l] >> kRankAt != 0) fault_at(w, i, l, "address is not in shared memory");
+    w.lanes<u32>(i.operand[0])[l] = (rank[l] + 1) << kRankAt | address[l];
+  });
+}
+void load_of_cluster(WarpState& w, const PtxInstruction& i) {
+  std::size_t offsets[kWarp];
+  std::fill(offsets, offsets + kWarp, SharedMemory::kNone);
+  const std::size_t size = access_size(i);
+  each_lane(w.active, [&](int l) {
+    const std::size_t address = in_shared(w, i, l), block = address >> kRankAt;
+    if (block == 0 || block > w.cluster.size()) fault_at(w, i, l, "address that mapa has not made");
+    SharedMemory& of = *w.cluster[block - 1];
+    const std::size_t at = offsets[l] = address & ((std::size_t{1} << kRankAt) - 1);
+    guarded(w, i, l, [&] { &of == w.shared ? of.read(at, size, w.thread(l)) : of.read_by_other(at, size); });
+    load_value(w, i, l, of.data() + at);
+  });
+  SharedMemory::count_conflicts(offsets, size);
+}
 void copy_async(WarpState& w, const PtxInstruction& i) {
   const u32* bytes = w.lanes<u32>(i.operand[2]);
   const u32* sizes = w.lanes<u32>(i.operand[3]);
@@ -407,6 +431,12 @@ const PtxOperation kOperations[] = {
     {"griddepcontrol.wait", "", [](WarpState& w, const PtxInstruction&) { w.early &= ~w.active; }},
     {"bar.sync", "d", nullptr, PtxInstruction::kBarrier},
     {"bar.warp.sync", "d", warp_barrier, PtxInstruction::kWarp},
+    {"barrier.cluster.arrive.release.aligned", "",
+     [](WarpState& w, const PtxInstruction&) { w.arrival = WarpState::kReleased; }, PtxInstruction::kWarp},
+    {"barrier.cluster.arrive.relaxed.aligned", "",
+     [](WarpState& w, const PtxInstruction&) { w.arrival = WarpState::kRelaxed; }, PtxInstruction::kWarp},
+    {"barrier.cluster.wait.acquire.aligned", "", nullptr, PtxInstruction::kCluster},
+    {"mapa.shared::cluster.u32", "ddd", map_to_block},
     {"shfl.sync.bfly.b32", "dpdddd", shuffle<true>, PtxInstruction::kWarp},
     {"shfl.sync.idx.b32", "dpdddd", shuffle<false>, PtxInstruction::kWarp},
     {"ldmatrix.sync.aligned.m8n8.x4.shared.b16", "dddds", matrices<false>, PtxInstruction::kWarp},
@@ -456,6 +486,7 @@ void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, c
 void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&) {
   const bool loads = operation == "ld";
   if (space == "param" && loads) return load_param;
+  if (space == "shared::cluster" && loads) return load_of_cluster;
   if (space == "global") return loads ? load_global : store_global;
   if (space == "shared") return loads ? access_shared<false> : access_shared<true>;
   return nullptr;

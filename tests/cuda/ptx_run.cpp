@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <bit>
 #include <random>
+#include <span>
 
 #include "cuda/fault.h"
 #include "cuda/ptx_warp.h"
@@ -35,8 +36,11 @@ u32 next_group(WarpState& w) {
 /// More instructions than any warp of the tests needs.
 constexpr long kForever = 50'000'000;
 
-/// Runs a warp until it ends (true) or stands at a barrier of the block.
-bool run_warp(WarpState& w, const PtxKernel& kernel) {
+/// Where a warp or a block has stopped: at its end, or at a barrier of the block or of the cluster.
+enum class Stop { none, end, barrier, cluster };
+
+/// Runs a warp until it stops.
+Stop run_warp(WarpState& w, const PtxKernel& kernel) {
   while (w.live != 0) {
     const u32 group = w.together ? w.live : next_group(w);
     const PtxInstruction& i = kernel.code.at(static_cast<std::size_t>(w.pc));
@@ -44,6 +48,8 @@ bool run_warp(WarpState& w, const PtxKernel& kernel) {
     if (i.has_guard) active &= i.guard_is_not ? ~w.mask(i.guard) : w.mask(i.guard);
     ++counts.instructions;
     if (++w.n_done > kForever) throw Fault("a warp does not come to an end");
+    if ((w.arrival != WarpState::kAway) != (i.kind == PtxInstruction::kCluster))
+      throw Fault("arrives at a barrier of the cluster and does not wait there, or the other way round: " + i.text);
     int next = w.pc + 1;
     u32 jumps = 0;
     switch (i.kind) {
@@ -60,6 +66,7 @@ bool run_warp(WarpState& w, const PtxKernel& kernel) {
         w.live &= ~active;
         break;
       case PtxInstruction::kBarrier:
+      case PtxInstruction::kCluster:
       case PtxInstruction::kWarp:
         if (active != kAll) {
           if (w.live != kAll || i.has_guard)
@@ -72,7 +79,7 @@ bool run_warp(WarpState& w, const PtxKernel& kernel) {
           i.run(w, i);
         } else {
           w.pc = next;
-          return false;
+          return i.kind == PtxInstruction::kBarrier ? Stop::barrier : Stop::cluster;
         }
     }
     const u32 stay = group & ~jumps & w.live;
@@ -84,23 +91,46 @@ bool run_warp(WarpState& w, const PtxKernel& kernel) {
     for (int l = 0; l < kWarp; ++l)
       if (group >> l & 1) w.pcs[l] = jumps >> l & 1 ? i.target : next;
   }
-  return true;
+  return Stop::end;
 }
 
 struct BlockIndex {
   unsigned x, y, z;
 };
+struct Block {
+  BlockIndex at;
+  SharedMemory shared;
+  std::vector<WarpState> warps;
+  std::vector<WarpState*> order;
+  std::uint32_t number;  // to device_memory()
+  Stop stop;
+};
+/// The cluster that runs; most have one block.
+struct Cluster {
+  const PtxKernel& kernel;
+  Extent grid;
+  unsigned n_thread;
+  std::span<Block> blocks;
+  std::vector<SharedMemory*> shared;  // of each block
+  std::minstd_rand random;
+  BlockIndex at;  // of the block whose turn it is
+};
 
-void run_block(const PtxKernel& kernel, Extent grid, BlockIndex at, unsigned n_thread, std::size_t n_shared,
-               const void* job, SharedMemory& shared, std::vector<WarpState>& warps, std::minstd_rand& random) {
+void begin_block(const Cluster& cluster, Block& block, BlockIndex at, std::size_t n_shared, const void* job) {
+  const PtxKernel& kernel = cluster.kernel;
+  const Extent& grid = cluster.grid;
+  const unsigned n_thread = cluster.n_thread;
   const std::size_t dynamic = (kernel.static_shared + 1023) / 1024 * 1024;
+  SharedMemory& shared = block.shared;
   shared.begin(dynamic + n_shared, static_cast<int>(n_thread));
-  device_memory().begin_block();
-  for (std::size_t i = 0; i < warps.size(); ++i) {
-    WarpState& w = warps[i];
+  block.at = at, block.number = device_memory().begin_block(), block.stop = Stop::none;
+  block.warps.resize(n_thread / kWarp), block.order.clear();
+  for (std::size_t i = 0; i < block.warps.size(); ++i) {
+    WarpState& w = block.warps[i];
+    block.order.push_back(&w);
     w.live = kAll, w.waits = 0, w.early = kernel.overlaps ? kAll : 0, w.together = true, w.pc = 0, w.n_done = 0;
     w.number = static_cast<int>(i), w.job = static_cast<const std::byte*>(job), w.job_size = kernel.param_size;
-    w.shared = &shared;
+    w.shared = &shared, w.cluster = cluster.shared, w.arrival = WarpState::kAway;
     w.wgmma.begin(shared, w.number), w.in_flight.clear(), w.sums.clear();
     w.registers.resize(kernel.register_bytes);
     std::copy(kernel.constants.begin(), kernel.constants.end(), w.registers.begin());
@@ -117,20 +147,53 @@ void run_block(const PtxKernel& kernel, Extent grid, BlockIndex at, unsigned n_t
         address.wide ? void(w.lanes<u64>(address.place)[l] = dynamic)
                      : void(w.lanes<u32>(address.place)[l] = static_cast<u32>(dynamic));
   }
-  std::vector<WarpState*> order;
-  for (WarpState& w : warps) order.push_back(&w);
-  while (true) {
-    if (schedule.seed) std::shuffle(order.begin(), order.end(), random);
-    std::size_t n_end = 0;
-    for (WarpState* w : order) n_end += run_warp(*w, kernel);
-    if (n_end == order.size()) break;
-    if (n_end != 0) throw Fault("some threads end while others wait at a barrier");
-    shared.barrier();
-    ++counts.barriers;
+}
+
+/// Runs a block until all its warps have stopped.
+void run_block(Cluster& cluster, Block& block) {
+  cluster.at = block.at;
+  device_memory().go_on(block.number);
+  if (schedule.seed) std::shuffle(block.order.begin(), block.order.end(), cluster.random);
+  block.stop = Stop::none;
+  for (WarpState* w : block.order) {
+    const Stop stop = run_warp(*w, cluster.kernel);
+    if (block.stop != Stop::none && stop != block.stop)
+      throw Fault(stop == Stop::end || block.stop == Stop::end ? "some threads end while others wait at a barrier"
+                                                               : "threads of a block wait at different barriers");
+    block.stop = stop;
   }
+  if (block.stop == Stop::barrier) block.shared.barrier(), ++counts.barriers;
+  if (block.stop != Stop::end) return;
   std::vector<const Wgmma*> products;
-  for (const WarpState& w : warps) products.push_back(&w.wgmma);
+  for (const WarpState& w : block.warps) products.push_back(&w.wgmma);
   check_warpgroups(products);
+  block.shared.end();
+}
+
+/// All blocks stand at a barrier of the cluster, and go on. It releases if every thread's arrival does.
+void meet(Cluster& cluster) {
+  bool releases = true;
+  for (Block& block : cluster.blocks)
+    for (WarpState& w : block.warps) releases &= std::exchange(w.arrival, WarpState::kAway) == WarpState::kReleased;
+  for (Block& block : cluster.blocks) block.shared.cluster_barrier(releases), block.stop = Stop::none;
+}
+
+void run_cluster(Cluster& cluster) {
+  std::vector<Block*> turns;
+  for (Block& block : cluster.blocks) turns.push_back(&block);
+  const auto stands = [&](Stop stop) {
+    return std::ranges::count(turns, stop, &Block::stop) == static_cast<std::ptrdiff_t>(turns.size());
+  };
+  while (!stands(Stop::end)) {
+    if (schedule.seed) std::shuffle(turns.begin(), turns.end(), cluster.random);
+    bool goes_on = false;
+    for (Block* block : turns)
+      if (block->stop != Stop::end && block->stop != Stop::cluster) run_block(cluster, *block), goes_on = true;
+    if (stands(Stop::cluster))
+      meet(cluster);
+    else if (!goes_on)
+      throw Fault("some blocks end while others wait at a barrier of the cluster");
+  }
 }
 
 }  // namespace
@@ -139,15 +202,20 @@ void run_ptx(const PtxKernel& kernel, Extent grid, unsigned n_thread, std::size_
   ++release_time;
   if (n_thread % kWarp != 0 || static_cast<int>(n_thread) > kernel.max_thread)
     throw Fault(kernel.name + ": " + std::to_string(n_thread) + " threads are not whole warps, or too many");
-  SharedMemory shared;
-  std::vector<WarpState> warps(n_thread / kWarp);
-  std::minstd_rand random(schedule.seed);
-  BlockIndex at = {};
+  static std::vector<Block> kept;  // whose memory was taken before
+  if (kept.size() < grid.cluster) kept.resize(grid.cluster);
+  const std::span blocks(kept.data(), grid.cluster);
+  Cluster cluster = {kernel, grid, n_thread, blocks, {}, std::minstd_rand(schedule.seed), {}};
+  for (Block& block : cluster.blocks) cluster.shared.push_back(&block.shared);
+  BlockIndex& at = cluster.at;
   try {
-    for (at.z = 0; at.z < grid.z; ++at.z)
-      for (at.y = 0; at.y < grid.y; ++at.y)
-        for (at.x = 0; at.x < grid.x; ++at.x)
-          run_block(kernel, grid, at, n_thread, n_shared, job, shared, warps, random);
+    for (unsigned z = 0; z < grid.z; z += grid.cluster)
+      for (unsigned y = 0; y < grid.y; ++y)
+        for (unsigned x = 0; x < grid.x; ++x) {
+          for (unsigned i = 0; i < grid.cluster; ++i)
+            begin_block(cluster, cluster.blocks[i], {x, y, z + i}, n_shared, job);
+          run_cluster(cluster);
+        }
   } catch (const Fault& problem) {
     throw Fault(kernel.name + ", block " + std::to_string(at.x) + "," + std::to_string(at.y) + "," +
                 std::to_string(at.z) + ": " + problem.what());

@@ -4,6 +4,7 @@
 
 #include <list>
 #include <map>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -36,6 +37,8 @@ struct WarpState {
   const std::byte* job = nullptr;
   std::size_t job_size = 0;
   SharedMemory* shared = nullptr;
+  std::span<SharedMemory* const> cluster;               // shared memory of its blocks
+  enum { kAway, kRelaxed, kReleased } arrival = kAway;  // at a barrier of the cluster
   Wgmma wgmma;
   std::list<WgmmaSums> sums;                                    // in flight
   std::map<u32, std::pair<WgmmaSums*, std::size_t>> in_flight;  // registers of such sums

@@ -25,7 +25,8 @@ void SharedMemory::begin(std::size_t size, int n_thread) {
   warp_time_.resize(std::max(warp_time_.size(), n / kWarp));
   open_.assign(n, {}), committed_.assign(n, {});
   fences_.assign(n, {}), async_done_.assign(n / kWarp, {}), async_readers_.clear();
-  begin_time_ = ++time_;  // whatever the block before did is over
+  cluster_time_ = begin_time_ = ++time_;  // whatever the block before did is over
+  others_read_.clear(), is_read_ = has_ended_ = false;
 }
 
 void SharedMemory::check_range(std::size_t offset, std::size_t size) const {
@@ -64,8 +65,36 @@ void SharedMemory::write(std::size_t offset, std::size_t size, int thread) {
     if (!ordered(word.write, thread)) throw Fault("race in shared memory: writes what another thread or a copy writes");
     if (!ordered(word.read, thread)) throw Fault("race in shared memory: writes what another thread reads");
     if (!async_readers_.empty()) check_async_readers(i, thread);
+    if (!others_read_.empty()) check_other_readers(i);
     word.write = now(thread);
   }
+}
+
+void SharedMemory::read_by_other(std::size_t offset, std::size_t size) {
+  check_range(offset, size);
+  if (has_ended_) throw Fault("reads shared memory of a block that has ended");
+  if (cluster_time_ == begin_time_) throw Fault("reads shared memory of another block before a barrier of the cluster");
+  others_read_.resize((size_ + 3) / 4);
+  is_read_ = true;
+  for (std::size_t i = offset / 4; i < (offset + size + 3) / 4; ++i) {
+    if (words_[i].write.time >= cluster_time_)  // also of a copy that has not arrived
+      throw Fault("race in shared memory: reads what another block writes");
+    others_read_[i] = time_;
+  }
+}
+
+void SharedMemory::cluster_barrier(bool releases) {
+  if (releases) cluster_time_ = ++time_;
+  is_read_ = false;
+}
+
+void SharedMemory::end() {
+  has_ended_ = true;
+  if (is_read_) throw Fault("ends while another block of its cluster may read its shared memory");
+}
+
+void SharedMemory::check_other_readers(std::size_t word) const {
+  if (others_read_[word] >= cluster_time_) throw Fault("race in shared memory: writes what another block reads");
 }
 
 void SharedMemory::copy(std::size_t offset, const void* from, std::size_t size, int thread) {

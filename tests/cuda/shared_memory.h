@@ -27,8 +27,9 @@ struct Schedule {
 };
 inline Schedule schedule = {};
 
-/// The shared memory of the block that runs. Every access is checked: range, alignment, and order. Two threads that
-/// touch one word of 4 bytes, of which one writes it, need a barrier between them, or within a warp a __syncwarp.
+/// The shared memory of a block that runs. Every access is checked: range, alignment, and order. Two threads that touch
+/// one word of 4 bytes, of which one writes it, need a barrier between them, or within a warp a __syncwarp. Threads of
+/// two blocks need a barrier of their cluster that releases, and a block that was read may not end before one.
 class SharedMemory {
  public:
   /// A block begins, with garbage.
@@ -40,6 +41,13 @@ class SharedMemory {
   void write(std::size_t offset, std::size_t size, int thread);
   void barrier() { ++time_; }
   void warp_barrier(int warp) { ++warp_time_[static_cast<std::size_t>(warp)]; }
+
+  /// A thread of another block of the cluster reads.
+  void read_by_other(std::size_t offset, std::size_t size);
+  /// All threads of the cluster have met. If it releases, other blocks may read what was written before.
+  void cluster_barrier(bool releases);
+  /// All threads of the block have ended.
+  void end();
 
   /// Asynchronous copies: zeros behind `size` of 16 bytes.
   void copy(std::size_t offset, const void* from, std::size_t size, int thread);
@@ -79,6 +87,7 @@ class SharedMemory {
   void check_range(std::size_t offset, std::size_t size) const;
   bool ordered(const Event& event, int thread) const;
   void check_async_readers(std::size_t word, int thread) const;
+  void check_other_readers(std::size_t word) const;
   Event now(int thread) const {
     const auto t = static_cast<std::size_t>(thread);
     return {thread, time_, warp_time_[t / kWarp], fences_[t].size()};
@@ -94,6 +103,9 @@ class SharedMemory {
   std::vector<std::vector<std::uint64_t>> fences_;                    // of each thread: their times
   std::vector<std::vector<std::uint64_t>> async_done_;                // of each warp and group: its time
   std::vector<std::array<std::uint32_t, kMostWarps>> async_readers_;  // of each word and warp: the last group, from 1
+  std::vector<std::uint64_t> others_read_;    // of each word, when another block read it; empty until one has
+  std::uint64_t cluster_time_ = 1;            // after the cluster's last barrier that released
+  bool is_read_ = false, has_ended_ = false;  // is_read_: by another block since the cluster's last barrier
   std::vector<std::uint64_t> warp_time_;
   std::vector<std::vector<Copy>> open_;                   // of each thread, since its last commit
   std::vector<std::deque<std::vector<Copy>>> committed_;  // the oldest group first
