@@ -30,10 +30,11 @@ constexpr Case kCases[] = {{1, 48, 32, 1},          {3, 100, 80, 1, true},      
                            {67, 430, 128, 1, true}, {130, 368, 146, 1, false, true}, {33, 700, 97, 3, true, true}};
 
 // For tiles of up to 192 columns and 256 rows: less than a tile, and more; halves of steps; more steps than stages;
-// splits of one step; columns that four at a time divide, and do not.
+// splits of one step and of more; columns that four at a time divide, and do not; blocks of a cluster without rows.
 constexpr Case kHopperCases[] = {
     {5, 48, 33, 1},          {260, 100, 200, 1, true, true}, {65, 700, 70, 1, true},
-    {67, 430, 128, 3, true}, {96, 290, 136, 3, false, true}, {130, 1100, 97, 2, true, true}};
+    {67, 430, 128, 3, true}, {96, 290, 136, 3, false, true}, {130, 1100, 97, 2, true, true},
+    {33, 560, 64, 4, true},  {70, 900, 40, 6, false, true},  {20, 1030, 132, 8, true, true}};
 
 class Trial {
  public:
@@ -86,7 +87,7 @@ class Trial {
   const {
     const Device<std::byte> x(x_), packed(packed_);
     const Device<float> scale(scale_), bias(bias_), residual(residual_), y(residual_.size());
-    const Device<int> partial(residual_.size() * static_cast<std::size_t>(c_.n_split));
+    const Device<int> partial(residual_.size() * static_cast<std::size_t>(c_.n_split));  // not of tiles for Hopper
     LinearInt8Job job = {x.get(),  packed.get(), scale.get(), depth() + 64, c_.n_row,
                          c_.d_out, depth(),      c_.n_split,  partial.get()};
     job.end = {c_.has_bias ? bias.get() : nullptr,
@@ -98,8 +99,11 @@ class Trial {
                Activation::none,
                false,
                false};
-    launch(made(job), job);
-    if (c_.n_split > 1) launch(finish_int8_partial(job), job);
+    const Launch how = made(job);
+    const bool is_cluster = how.cluster > 1;
+    if (is_cluster) job.partial = nullptr;
+    launch(how, job);
+    if (c_.n_split > 1 && !is_cluster) launch(finish_int8_partial(job), job);
     return y.host();
   }
 

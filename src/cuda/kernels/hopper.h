@@ -4,9 +4,9 @@
 
 #include "cuda/kernels/device.h"
 
-/// Products of a warpgroup (four consecutive warps from a multiple of four on), for files that are compiled only for
-/// sm_90a. For the host's compiler tests/cuda/emulation.h has the same functions. Source: PTX ISA 9.0, "Asynchronous
-/// Warpgroup Level Matrix Multiply-Accumulate Instructions".
+/// Products of a warpgroup (four consecutive warps from a multiple of four on) and clusters of blocks, for files that
+/// are compiled only for sm_90a. For the host's compiler tests/cuda/emulation.h has the same functions. Source: PTX
+/// ISA 9.0, "Asynchronous Warpgroup Level Matrix Multiply-Accumulate Instructions".
 #ifdef __CUDACC__
 
 namespace vla::cuda::dev {
@@ -14,6 +14,26 @@ namespace vla::cuda::dev {
 /// Makes this thread's writes to shared memory visible to wgmma, also those of copies that it has waited for. A barrier
 /// must follow before another thread's wgmma reads them.
 VLA_DEVICE void fence_async_proxy() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
+
+/// Waits until all threads of the cluster have come here. What they wrote to shared memory before is visible to all.
+VLA_DEVICE void meet_cluster() {
+  asm volatile("barrier.cluster.arrive.release.aligned;\nbarrier.cluster.wait.acquire.aligned;" ::: "memory");
+}
+/// Waits likewise, but makes nothing visible: a block whose shared memory others read calls it at its end.
+VLA_DEVICE void leave_cluster() {
+  asm volatile("barrier.cluster.arrive.relaxed.aligned;\nbarrier.cluster.wait.acquire.aligned;" ::: "memory");
+}
+/// Reads the 16 bytes that block `rank` of the cluster has where this block has those at p.
+VLA_DEVICE uint4 read_of_block(const std::byte* p, int rank) {
+  unsigned from;
+  uint4 to;
+  asm("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(from) : "r"(shared_address(p)), "r"(rank));
+  asm volatile("ld.shared::cluster.v4.u32 {%0, %1, %2, %3}, [%4];"
+               : "=r"(to.x), "=r"(to.y), "=r"(to.z), "=r"(to.w)
+               : "r"(from)
+               : "memory");
+  return to;
+}
 
 /// Must precede the first wgmma, and each wgmma after other instructions have read or written the sums.
 VLA_DEVICE void wgmma_fence() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }

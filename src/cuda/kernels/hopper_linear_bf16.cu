@@ -70,16 +70,11 @@ VLA_DEVICE void multiply(const LinearBf16Job& job, int block) {
   dev::wgmma_wait_all(sum);
   dev::wait_copies<0>();
   __syncthreads();  // the stages' memory is reused for sums
-  using End = TileEnd<T::kColumns, T::kRows, T::kGated>;
+  using End = TileEnd<float, T::kColumns, T::kRows, T::kGated>;
   End::place(sum, shared);
-  __syncthreads();
   const End end(job, job.gate_bias, row0, column0);
-  const auto nothing = [](int) { return 0; };
-  if (job.n_split > 1)
-    end.leave(shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_sum(), nothing,
-              [](int, unsigned bits) { return bits; });
-  else
-    end.finish(shared, nothing, [](int, unsigned bits, int) { return dev::float_of(static_cast<int>(bits)); });
+  end.finish(
+      shared, [](int) { return 0; }, [](int, float of_column, int) { return of_column; });
 }
 
 }  // namespace

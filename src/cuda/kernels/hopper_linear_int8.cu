@@ -115,19 +115,9 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   dev::wgmma_wait_all(sum);
   dev::wait_copies<0>();
   __syncthreads();  // the stages' memory is reused for sums
-  using End = TileEnd<T::kColumns, T::kRows, false>;
+  using End = TileEnd<int, T::kColumns, T::kRows, false>;
   End::place(sum, shared);
-  __syncthreads();
   const End end(job, nullptr, row0, column0);
-  // Ternary codes are stored plus 1, which adds the row's sum of codes; the first share of the depth subtracts it.
-  const auto exact = [&](int sum_of_row, unsigned bits) {
-    return static_cast<int>(bits) - (T::kKind == CodeKind::ternary && z == 0 ? sum_of_row : 0);
-  };
-  if (job.n_split > 1)
-    return end.leave(
-        shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_column,
-        [&](int row) { return RowScale(job, row); },
-        [&](const RowScale& of, unsigned bits) { return static_cast<unsigned>(exact(of.sum, bits)); });
   const int column = column0 + thread_index() % (T::kColumns / 4) * 4;
   float scale[4];
   bool are_plain = true;
@@ -136,9 +126,12 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
     scale[c] = column + c < job.n_column ? job.scale[column + c] : 0;
     are_plain = are_plain && (scale[c] == 0 || is_plain(scale[c]));
   }
+  // Ternary codes are stored plus 1, which adds the row's sum of codes.
   end.finish(
       shared, [&](int row) { return RowRatios(job, row, scale, are_plain); },
-      [&](const RowRatios& of, unsigned bits, int c) { return of.scaled(exact(of.sum, bits), c); });
+      [&](const RowRatios& of, int of_column, int c) {
+        return of.scaled(of_column - (T::kKind == CodeKind::ternary ? of.sum : 0), c);
+      });
 }
 
 }  // namespace

@@ -44,7 +44,9 @@ class FetchRows {
 /// The end of a tile. Its sums pass through shared memory, in rows of kColumns words and four more against bank
 /// conflicts. A thread finishes the same four columns of every kRowsAtOnce-th row. Gated: the first half of a row holds
 /// the sums of the gate's matrix, the second half the other matrix's sums of the same columns.
-template <int kColumns, int kRows, bool kGated>
+/// If the depth is split, the blocks of a tile are a cluster. Each finishes rows of its own, for which it adds all
+/// blocks' sums in the order of the shares.
+template <class Sum, int kColumns, int kRows, bool kGated>
 class TileEnd {
  public:
   template <class Job>
@@ -52,6 +54,7 @@ class TileEnd {
       : e_(job.end),
         gate_bias_(gate_bias),
         row0_(row0),
+        n_split_(job.n_split),
         n_column_(job.n_column),
         column_(column0 + thread_index() % kQuads * 4) {
     n_ = job.n_column - column_;
@@ -59,12 +62,11 @@ class TileEnd {
     end_ = n_ <= 0 ? 0 : left < kRows ? left : kRows;
     const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
     const auto all = bits(e_.bias) | bits(e_.factor) | bits(e_.gate) | bits(e_.residual) | bits(e_.y) | bits(gate_bias);
-    together_ = job.n_column % 4 == 0 && e_.y_stride % 4 == 0 && (all | bits(job.partial)) % 16 == 0;
+    together_ = job.n_column % 4 == 0 && e_.y_stride % 4 == 0 && all % 16 == 0;
   }
 
   /// Writes a thread's sums of wgmma; lanes of a warp write to different banks.
-  template <class T>
-  static VLA_DEVICE void place(const T (&sum)[kRows / 2], std::byte* to) {
+  static VLA_DEVICE void place(const Sum (&sum)[kRows / 2], std::byte* to) {
     const int lane = thread_index() % kLanes, column = thread_index() / kLanes * 16 + lane / 4;
 #pragma unroll
     for (int i = 0; i < kRows / 2; ++i) {
@@ -73,49 +75,40 @@ class TileEnd {
     }
   }
 
-  /// Stores word(of_row(row), bits of a sum) to the partial sums of one share of the depth, which begin at `partial`.
-  /// In each row the gate's sums come first.
-  template <class OfRow, class Word>
-  VLA_DEVICE void leave(const std::byte* sums, void* partial, OfRow of_row, Word word) const {
-    if (together_)
-      leave_rows<kBatch, true>(sums, partial, of_row, word);
-    else
-      leave_rows<1, false>(sums, partial, of_row, word);
-  }
-  /// Computes y from value(of_row(row), bits of a sum, index of the column among the thread's four).
+  /// Computes y from value(of_row(row), a sum, index of the column among the thread's four), once all threads of the
+  /// block, or of the cluster, have called it.
   template <class OfRow, class Value>
   VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value) const {
-    const auto one = [&](auto activate) { finish_rows<1, false>(sums, of_row, value, activate); };
-    if (!together_) return one([&](float x) { return activate(e_.activation, x); });
-    with_activation(
-        e_.activation, [&](auto activate) { finish_rows<kBatch, true>(sums, of_row, value, activate); }, one);
+    if (n_split_ == 1) {
+      __syncthreads();  // sums of all warps are there
+      return finish_part<false>(sums, of_row, value);
+    }
+    dev::meet_cluster();  // sums of all blocks are there
+    finish_part<true>(sums, of_row, value);
+    dev::leave_cluster();  // no block reads them any more
   }
 
  private:
-  static constexpr int kQuads = kColumns / 4 / (kGated ? 2 : 1), kRowsAtOnce = kColumns * 2 / kQuads, kBatch = 4;
+  static constexpr int kQuads = kColumns / 4 / (kGated ? 2 : 1), kRowsAtOnce = kColumns * 2 / kQuads;
+  struct Sums {
+    Sum of[4];
+  };
 
-  template <int kRowsAhead, bool kTogether, class OfRow, class Word>
-  VLA_DEVICE void leave_rows(const std::byte* sums, void* partial, OfRow of_row, Word word) const {
-    constexpr int kHalves = kGated ? 2 : 1;
-    auto* to = static_cast<unsigned*>(partial) + column_;
-#pragma unroll 1
-    for (int first = thread_index() / kQuads; first < end_; first += kRowsAtOnce * kRowsAhead)
-#pragma unroll
-      for (int i = 0; i < kRowsAhead; ++i) {
-        const int row = first + kRowsAtOnce * i;
-        if (row >= end_) break;
-        const auto of = of_row(row0_ + row);
-#pragma unroll
-        for (int half = 0; half < kHalves; ++half) {
-          const uint4 four = sums_of(sums, row, half);
-          const unsigned words[4] = {word(of, four.x), word(of, four.y), word(of, four.z), word(of, four.w)};
-          const std::int64_t at = static_cast<std::int64_t>(row0_ + row) * kHalves + half;
-          store_four(to + at * n_column_, words, kTogether, n_);
-        }
-      }
+  /// kSplit: whether the depth is split. Then the rare activations share code, since the shares' loads make it long.
+  template <bool kSplit, class OfRow, class Value>
+  VLA_DEVICE void finish_part(const std::byte* sums, OfRow of_row, Value value) const {
+    constexpr int kRowsAhead = kSplit ? 2 : 4;
+    const auto ahead = [&](auto activate) { finish_rows<kRowsAhead, true, kSplit>(sums, of_row, value, activate); };
+    const auto one = [&](auto activate) { finish_rows<1, false, kSplit>(sums, of_row, value, activate); };
+    const bool is_rare = e_.activation != Activation::none && !is_sigmoid(e_.activation);
+    if (!together_ || (kSplit && is_rare)) return one([&](float x) { return activate(e_.activation, x); });
+    with_activation(e_.activation, ahead, [&](auto activate) {
+      if constexpr (!kSplit) one(activate);
+    });
   }
-  /// Implements `finish` for one activation. Loads of kRowsAhead rows are in flight at a time.
-  template <int kRowsAhead, bool kTogether, class OfRow, class Value, class Activate>
+  /// Implements `finish` for one activation. Loads of kRowsAhead rows are in flight at a time, also of other blocks'
+  /// sums.
+  template <int kRowsAhead, bool kTogether, bool kSplit, class OfRow, class Value, class Activate>
   VLA_DEVICE void finish_rows(const std::byte* sums, OfRow of_row, Value value, Activate activate) const {
     const auto load = [&](const float* from, std::int64_t at, float otherwise) {
       return from && n_ > 0 ? load_four(from + at, kTogether || together_, n_)
@@ -123,47 +116,76 @@ class TileEnd {
     };
     const Four bias = load(e_.bias, column_, kAddsNothing), factor = load(e_.factor, column_, kScalesNothing);
     const Four gate_bias = load(kGated ? gate_bias_ : nullptr, column_, kAddsNothing);
+    const int part = kSplit ? static_cast<int>(blockIdx.z) : 0, apart = kRowsAtOnce * (kSplit ? n_split_ : 1);
 #pragma unroll 1
-    for (int first = thread_index() / kQuads; first < end_; first += kRowsAtOnce * kRowsAhead) {
+    for (int first = thread_index() / kQuads + kRowsAtOnce * part; first < end_; first += apart * kRowsAhead) {
       Four gate[kRowsAhead], residual[kRowsAhead];
       decltype(of_row(0)) of[kRowsAhead] = {};
+      Sums sum[kRowsAhead] = {}, gate_sum[kRowsAhead] = {};
+      const auto read = [&](int i, int row) {
+        sum[i] = sums_of<kSplit>(sums, row, kGated ? 1 : 0);
+        if constexpr (kGated) gate_sum[i] = sums_of<kSplit>(sums, row, 0);
+      };
 #pragma unroll
       for (int i = 0; i < kRowsAhead; ++i) {
-        const int row = row0_ + first + kRowsAtOnce * i;
-        if (first + kRowsAtOnce * i >= end_) break;
+        const int row = row0_ + first + apart * i;
+        if (first + apart * i >= end_) break;
         of[i] = of_row(row);
         const std::int64_t at = static_cast<std::int64_t>(row) * n_column_ + column_;
         gate[i] = load(kGated ? nullptr : e_.gate, at, 0);
         residual[i] = load(e_.residual, at, kAddsNothing);
+        if constexpr (kSplit) read(i, row - row0_);
       }
 #pragma unroll
       for (int i = 0; i < kRowsAhead; ++i) {
-        const int row = first + kRowsAtOnce * i;
+        const int row = first + apart * i;
         if (row >= end_) break;
-        const uint4 four = sums_of(sums, row, kGated ? 1 : 0);
-        const unsigned words[4] = {four.x, four.y, four.z, four.w};
+        if constexpr (!kSplit) read(i, row);
         if constexpr (kGated) {
-          const uint4 others = sums_of(sums, row, 0);
-          const unsigned gates[4] = {others.x, others.y, others.z, others.w};
 #pragma unroll
-          for (int c = 0; c < 4; ++c) gate[i].of[c] = dev::add(value(of[i], gates[c], c), gate_bias.of[c]);
+          for (int c = 0; c < 4; ++c) gate[i].of[c] = dev::add(value(of[i], gate_sum[i].of[c], c), gate_bias.of[c]);
         }
         Four y;
 #pragma unroll
         for (int c = 0; c < 4; ++c)
-          y.of[c] = cuda::finish(e_, kGated || e_.gate != nullptr, value(of[i], words[c], c), bias.of[c], factor.of[c],
-                                 gate[i].of[c], residual[i].of[c], activate);
+          y.of[c] = cuda::finish(e_, kGated || e_.gate != nullptr, value(of[i], sum[i].of[c], c), bias.of[c],
+                                 factor.of[c], gate[i].of[c], residual[i].of[c], activate);
         store_y(e_, row0_ + row, column_, y, kTogether || together_, n_);
       }
     }
   }
-  VLA_DEVICE uint4 sums_of(const std::byte* sums, int row, int half) const {
-    return dev::read<uint4>(sums + (row * (kColumns + 4) + (half * kQuads + thread_index() % kQuads) * 4) * 4);
+  static VLA_DEVICE float of_bits(unsigned bits, float) { return dev::float_of(static_cast<int>(bits)); }
+  static VLA_DEVICE int of_bits(unsigned bits, int) { return static_cast<int>(bits); }
+  static VLA_DEVICE Sums sums_in(const uint4& four) {
+    return {{of_bits(four.x, Sum()), of_bits(four.y, Sum()), of_bits(four.z, Sum()), of_bits(four.w, Sum())}};
+  }
+  /// A thread's four sums of a row.
+  template <bool kSplit>
+  VLA_DEVICE Sums sums_of(const std::byte* sums, int row, int half) const {
+    sums += (row * (kColumns + 4) + (half * kQuads + thread_index() % kQuads) * 4) * 4;
+    if constexpr (kSplit)
+      return add_shares(sums);
+    else
+      return sums_in(dev::read<uint4>(sums));
+  }
+  /// Adds what the cluster's blocks have at `sums`; a share that there is not is zeros.
+  VLA_DEVICE Sums add_shares(const std::byte* sums) const {
+    uint4 share[kMostSplits];
+#pragma unroll
+    for (int z = 0; z < kMostSplits; ++z) share[z] = z < n_split_ ? dev::read_of_block(sums, z) : uint4{0, 0, 0, 0};
+    Sums all = {};
+#pragma unroll
+    for (int z = 0; z < kMostSplits; ++z) {
+      const Sums one = sums_in(share[z]);
+#pragma unroll
+      for (int c = 0; c < 4; ++c) all.of[c] += one.of[c];
+    }
+    return all;
   }
 
   const Epilogue& e_;
   const float* gate_bias_;
-  int row0_, n_column_, column_, n_, end_;  // n_: columns from column_ on; end_: rows to finish
+  int row0_, n_split_, n_column_, column_, n_, end_;  // n_: columns from column_ on; end_: rows to finish
   bool together_;
 };
 

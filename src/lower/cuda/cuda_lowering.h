@@ -44,7 +44,7 @@ struct CudaOp : Step {
   ProductCut cut = {};      // LinearOp only
   AttentionPlan plan = {};  // AttentionOp only
   ValueId gate = kNone;     // the gate product's result, if no kernel computes gate and up together
-  ValueId partial = kNone;  // partial results of the shares of the depth or of the keys
+  ValueId partial = kNone;  // partial results of the shares of the depth or of the keys; none of Hopper tiles
   std::shared_ptr<const CudaOp> finishes = nullptr;  // norms only: the product whose depth shares are added first
 };
 /// Whether another operation adds the depth shares of this product.

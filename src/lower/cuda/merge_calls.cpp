@@ -25,13 +25,11 @@ bool is_strip(const Calls& calls) {
   return job.n_split == 1 && job.gate_weight == nullptr;
 }
 bool is_heads(const Calls& calls) { return calls.size() == 1 && calls[0].how.kernel == std::string_view("head_rows"); }
-/// The Hopper tile of a bf16 product, if a kernel computes several products with this tile and no other operation adds
-/// the product's shares; else null.
+/// The Hopper tile of a bf16 product, if a kernel computes several products with this tile; else null.
 const cuda::HopperTile* tile_of(const Calls& calls) {
   const std::string_view kernel = calls[0].how.kernel;
   const auto* tile = std::ranges::find(cuda::kHopperTiles, kernel, &cuda::HopperTile::kernel);
-  if (tile == std::end(cuda::kHopperTiles) || tile->several == nullptr) return nullptr;
-  return (job_of<cuda::LinearBf16Job>(calls[0]).n_split > 1) == (calls.size() == 2) ? tile : nullptr;
+  return tile != std::end(cuda::kHopperTiles) && tile->several != nullptr ? tile : nullptr;
 }
 
 /// Merges operations for which `fits` holds and that agree with the first one (`agrees`), up to kMostJobs at a time.
@@ -75,12 +73,8 @@ void merge_calls(std::vector<Calls>& phase, int n_sm) {
       phase, [](const Calls& calls) { return tile_of(calls) != nullptr; },
       [](const Calls& a, const Calls& b) { return tile_of(a) == tile_of(b) && are_alike(a, b); },
       [](const Calls& first, Products& jobs) {
-        const cuda::Launch product = cuda::hopper_linears_bf16(*tile_of(first), jobs);
-        Calls calls = {call(product, jobs)};
-        if (jobs.job[0].n_split == 1) return calls;
-        const cuda::Launch finish = cuda::finish_bf16_partials(jobs);
-        calls.push_back(call(finish, jobs));
-        return calls;
+        const cuda::Launch how = cuda::hopper_linears_bf16(*tile_of(first), jobs);
+        return Calls{call(how, jobs)};
       });
   merge<cuda::HeadJob>(
       phase, is_heads, [](const Calls&, const Calls&) { return true; },

@@ -126,12 +126,11 @@ class Bench {
         if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
         VLA_CHECK(tell("bf16", size, name, n_split, jobs, launches));
       }
-    if (timer_.gpu().is_hopper() && size.n_row > 32) return run_hopper(size, x, matrices, partial, end);
+    if (timer_.gpu().is_hopper() && size.n_row > 32) return run_hopper(size, x, matrices, end);
     return {};
   }
 
-  Status run_hopper(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Buffer& partial,
-                    const Epilogue& end) {
+  Status run_hopper(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Epilogue& end) {
     const std::int64_t stride = round_up(size.depth, 8);
     VLA_TRY(const Buffer bias, timer_.upload(numbers_.floats(size.n_column)));
     for (const HopperTile& tile : kHopperTiles)
@@ -142,12 +141,11 @@ class Bench {
         for (const Buffer& matrix : matrices) {
           const int n_column = tile.is_gated ? size.n_column / 2 : size.n_column;
           const auto* weight = matrix.as<std::uint16_t>();
-          jobs.push_back({x.as<void>(), weight, stride, stride, size.n_row, n_column, size.depth, n_split,
-                          partial.as<float>(), end});
+          jobs.push_back(
+              {x.as<void>(), weight, stride, stride, size.n_row, n_column, size.depth, n_split, nullptr, end});
           if (tile.is_gated) jobs.back().gate_weight = weight + n_column * stride;
         }
-        std::vector<Launch> launches = {hopper_linear_bf16(tile, jobs[0])};
-        if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
+        const std::vector<Launch> launches = {hopper_linear_bf16(tile, jobs[0])};
         VLA_CHECK(tell(tile.is_gated ? "bf16 gated" : "bf16", size, tile.kernel, n_split, jobs, launches));
         if (tile.is_gated || n_split > 1 || size.n_row <= 64) continue;
         // What a vision tower's first product of an MLP ends in.
@@ -184,10 +182,9 @@ class Bench {
         std::vector<LinearInt8Job> jobs;
         for (const Buffer& matrix : matrices)
           jobs.push_back({x.as<std::byte>(), matrix.as<std::byte>(), scale.as<float>(), stride, size.n_row,
-                          size.n_column, static_cast<int>(kernels::quantized_depth(size.depth)), n_split,
-                          partial.as<int>(), end});
-        std::vector<Launch> launches = {hopper_linear_int8(tile, jobs[0])};
-        if (n_split > 1) launches.push_back(finish_int8_partial(jobs[0]));
+                          size.n_column, static_cast<int>(kernels::quantized_depth(size.depth)), n_split, nullptr,
+                          end});
+        const std::vector<Launch> launches = {hopper_linear_int8(tile, jobs[0])};
         VLA_CHECK(tell(kind, size, tile.kernel, n_split, jobs, launches));
       }
     return {};

@@ -48,7 +48,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                        .gate_bias = gate ? l.param(gate->bias) : nullptr};
       calls.push_back(
           call(tile ? cuda::hopper_linear_bf16(cuda::kHopperTiles[*tile], job) : cuda::linear_bf16(shape, job), job));
-      if (job.n_split > 1 && !leaves_shares(op)) calls.push_back(call(cuda::finish_bf16_partial(job), job));
+      if (op.partial != kNone && !leaves_shares(op)) calls.push_back(call(cuda::finish_bf16_partial(job), job));
       return;
     }
     case MatrixKind::ternary:
@@ -67,7 +67,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
       calls.push_back(call(tile ? cuda::hopper_linear_int8(cuda::kHopperInt8Tiles[*tile], job)
                                 : cuda::linear_int8(code_kind(matrix.kind), int8_shape(shape), job),
                            job));
-      if (job.n_split > 1) calls.push_back(call(cuda::finish_int8_partial(job), job));
+      if (op.partial != kNone) calls.push_back(call(cuda::finish_int8_partial(job), job));
       return;
     }
   }
