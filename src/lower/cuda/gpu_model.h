@@ -28,7 +28,8 @@ Result<GpuModel> find_gpu_model(const std::string& name);
 /// Predicts the time of a program's phases. A phase takes the longer of two times: its products and attention in whole
 /// waves of blocks, limited by the issue slots or tensor time of their main loops; and reading all operands once. The
 /// launches and the smallest kernel's time are added. On Hopper, products and attention take times fitted to
-/// measurements instead. Entries: see Program::predictions. n_launch: kernels per operation.
+/// measurements instead, and clusters an assumed one. Entries: see Program::predictions. n_launch: kernels per
+/// operation.
 std::vector<Program::Prediction> predict(const CudaLowering& l, const std::vector<int>& n_launch, const GpuModel& gpu);
 
 }  // namespace vla::lower
