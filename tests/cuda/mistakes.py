@@ -340,6 +340,18 @@ MISTAKES = {
         "block - jobs.end[i - 1]",
         "block",
     ),
+    "no barrier before sums are left": (
+        "hopper_tile.h",
+        "hopper_linear_bf16",
+        "    __syncthreads();  // sums of all warps are there, to be left\n",
+        "",
+    ),
+    "a share of the gate's sums in the place of another": (
+        "hopper_tile.h",
+        "hopper_linear_bf16",
+        "(row0_ + row) * kHalves + half;",
+        "(row0_ + row) * kHalves + kHalves - 1 - half;",
+    ),
     "no barrier of the cluster before shares are read": (
         "hopper_tile.h",
         "hopper_linear_bf16",
@@ -457,8 +469,14 @@ MISTAKES = {
     "each share of the depth takes the offset off": (
         "hopper_linear_int8.cu",
         "hopper_linear_int8",
-        "T::kKind == CodeKind::ternary ? of.sum",
-        "T::kKind == CodeKind::ternary ? of.sum * job.n_split",
+        "T::kKind == CodeKind::ternary && z == 0 ?",
+        "T::kKind == CodeKind::ternary ?",
+    ),
+    "a cluster takes the offset off for each share": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "(T::kKind == CodeKind::ternary ? of.sum",
+        "(T::kKind == CodeKind::ternary ? of.sum * job.n_split",
     ),
     "a block of codes ends while its shares are read": (
         "hopper_tile.h",

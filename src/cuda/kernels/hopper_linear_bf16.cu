@@ -73,8 +73,12 @@ VLA_DEVICE void multiply(const LinearBf16Job& job, int block) {
   using End = TileEnd<float, T::kColumns, T::kRows, T::kGated>;
   End::place(sum, shared);
   const End end(job, job.gate_bias, row0, column0);
-  end.finish(
-      shared, [](int) { return 0; }, [](int, float of_column, int) { return of_column; });
+  const auto nothing = [](int) { return 0; };
+  if (job.partial)
+    end.leave(shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_sum(), nothing,
+              [](int, float of_column) { return static_cast<unsigned>(dev::bits_of(of_column)); });
+  else
+    end.finish(shared, nothing, [](int, float of_column, int) { return of_column; });
 }
 
 }  // namespace

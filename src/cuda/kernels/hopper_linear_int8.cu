@@ -118,6 +118,14 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   using End = TileEnd<int, T::kColumns, T::kRows, false>;
   End::place(sum, shared);
   const End end(job, nullptr, row0, column0);
+  // Ternary codes are stored plus 1, which adds the row's sum of codes, once in all shares.
+  if (job.partial)
+    return end.leave(
+        shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_column,
+        [&](int row) { return RowScale(job, row); },
+        [&](const RowScale& of, int of_column) {
+          return static_cast<unsigned>(of_column - (T::kKind == CodeKind::ternary && z == 0 ? of.sum : 0));
+        });
   const int column = column0 + thread_index() % (T::kColumns / 4) * 4;
   float scale[4];
   bool are_plain = true;
@@ -126,7 +134,6 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
     scale[c] = column + c < job.n_column ? job.scale[column + c] : 0;
     are_plain = are_plain && (scale[c] == 0 || is_plain(scale[c]));
   }
-  // Ternary codes are stored plus 1, which adds the row's sum of codes.
   end.finish(
       shared, [&](int row) { return RowRatios(job, row, scale, are_plain); },
       [&](const RowRatios& of, int of_column, int c) {

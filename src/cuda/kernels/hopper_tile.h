@@ -44,8 +44,8 @@ class FetchRows {
 /// The end of a tile. Its sums pass through shared memory, in rows of kColumns words and four more against bank
 /// conflicts. A thread finishes the same four columns of every kRowsAtOnce-th row. Gated: the first half of a row holds
 /// the sums of the gate's matrix, the second half the other matrix's sums of the same columns.
-/// If the depth is split, the blocks of a tile are a cluster. Each finishes rows of its own, for which it adds all
-/// blocks' sums in the order of the shares.
+/// If the depth is split, a block leaves partial sums, or the blocks of a tile are a cluster: each finishes rows of its
+/// own, for which it adds all blocks' sums in the order of the shares.
 template <class Sum, int kColumns, int kRows, bool kGated>
 class TileEnd {
  public:
@@ -62,7 +62,7 @@ class TileEnd {
     end_ = n_ <= 0 ? 0 : left < kRows ? left : kRows;
     const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
     const auto all = bits(e_.bias) | bits(e_.factor) | bits(e_.gate) | bits(e_.residual) | bits(e_.y) | bits(gate_bias);
-    together_ = job.n_column % 4 == 0 && e_.y_stride % 4 == 0 && all % 16 == 0;
+    together_ = job.n_column % 4 == 0 && e_.y_stride % 4 == 0 && (all | bits(job.partial)) % 16 == 0;
   }
 
   /// Writes a thread's sums of wgmma; lanes of a warp write to different banks.
@@ -75,6 +75,16 @@ class TileEnd {
     }
   }
 
+  /// Stores word(of_row(row), a sum) to the partial sums of one share of the depth, which begin at `partial`, once all
+  /// threads of the block have called it. In each row the gate's sums come first.
+  template <class OfRow, class Word>
+  VLA_DEVICE void leave(const std::byte* sums, void* partial, OfRow of_row, Word word) const {
+    __syncthreads();  // sums of all warps are there, to be left
+    if (together_)
+      leave_rows<4, true>(sums, partial, of_row, word);
+    else
+      leave_rows<1, false>(sums, partial, of_row, word);
+  }
   /// Computes y from value(of_row(row), a sum, index of the column among the thread's four), once all threads of the
   /// block, or of the cluster, have called it.
   template <class OfRow, class Value>
@@ -94,7 +104,28 @@ class TileEnd {
     Sum of[4];
   };
 
-  /// kSplit: whether the depth is split. Then the rare activations share code, since the shares' loads make it long.
+  template <int kRowsAhead, bool kTogether, class OfRow, class Word>
+  VLA_DEVICE void leave_rows(const std::byte* sums, void* partial, OfRow of_row, Word word) const {
+    constexpr int kHalves = kGated ? 2 : 1;
+    auto* to = static_cast<unsigned*>(partial) + column_;
+#pragma unroll 1
+    for (int first = thread_index() / kQuads; first < end_; first += kRowsAtOnce * kRowsAhead)
+#pragma unroll
+      for (int i = 0; i < kRowsAhead; ++i) {
+        const int row = first + kRowsAtOnce * i;
+        if (row >= end_) break;
+        const auto of = of_row(row0_ + row);
+#pragma unroll
+        for (int half = 0; half < kHalves; ++half) {
+          const Sums four = sums_of<false>(sums, row, half);
+          const unsigned words[4] = {word(of, four.of[0]), word(of, four.of[1]), word(of, four.of[2]),
+                                     word(of, four.of[3])};
+          const std::int64_t at = static_cast<std::int64_t>(row0_ + row) * kHalves + half;
+          store_four(to + at * n_column_, words, kTogether, n_);
+        }
+      }
+  }
+  /// kSplit: whether a cluster adds shares. Then the rare activations share code, since the shares' loads make it long.
   template <bool kSplit, class OfRow, class Value>
   VLA_DEVICE void finish_part(const std::byte* sums, OfRow of_row, Value value) const {
     constexpr int kRowsAhead = kSplit ? 2 : 4;

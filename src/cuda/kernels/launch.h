@@ -33,6 +33,11 @@ constexpr unsigned kMaxShared = 99 << 10;
 constexpr unsigned kHopperShared = 227 << 10;
 /// Most blocks of a cluster on every Hopper.
 constexpr unsigned kMaxCluster = 8;
+/// The cluster of a product in Hopper's tiles: its shares of the depth, unless they go to partial sums.
+template <class Job>
+unsigned cluster_of(const Job& job) {
+  return job.partial != nullptr ? 1 : static_cast<unsigned>(job.n_split);
+}
 /// Most blocks of a grid in y and z.
 constexpr unsigned kMaxGridYZ = 65535;
 

@@ -210,17 +210,22 @@ VLA_DEVICE void finish_four(const LinearBf16Job& job, int row, int column) {
   finish_four<kTogether>(job.end, row, column, job.n_column, sum, job.gate_weight || job.end.gate, gate);
 }
 
-}  // namespace
-
 /// Adds the partial sums of a split and computes y.
-VLA_KERNEL(linear_bf16_finish, 128, 4, LinearBf16Job) {
-  const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 4;
+VLA_DEVICE void finish_partial(const LinearBf16Job& job, int block) {
+  const int row = static_cast<int>(blockIdx.y), column = (block * 128 + thread_index()) * 4;
   if (column >= job.n_column) return;
   const auto others = reinterpret_cast<std::uint64_t>(job.gate_bias) | reinterpret_cast<std::uint64_t>(job.partial);
   if (is_of_fours(job.end, job.n_column) && others % 16 == 0 && job.n_split <= kMostSplits)
     finish_four<true>(job, row, column);
   else
     finish_four<false>(job, row, column);
+}
+
+}  // namespace
+
+VLA_KERNEL(linear_bf16_finish, 128, 4, LinearBf16Job) { finish_partial(job, static_cast<int>(blockIdx.x)); }
+VLA_KERNEL(linear_bf16_finishes, 128, 4, Several<LinearBf16Job>) {
+  run_one(job, blockIdx.x, [](const LinearBf16Job& one, int block) { finish_partial(one, block); });
 }
 
 }  // namespace vla::cuda

@@ -16,8 +16,8 @@ struct LinearBf16Job {
   std::int64_t x_stride, weight_stride;
   int n_row, n_column, depth;  // elements of a row after the depth are ignored
   /// With more than one split, each writes its sums over a share of the depth to partial [n_column, n_row, n_split];
-  /// `finish_bf16_partial` adds them in order and computes y. Hopper's tiles add them in the same order in clusters of
-  /// up to kMaxCluster blocks instead, and have no use for `partial`.
+  /// `finish_bf16_partial` adds them in order and computes y. Without `partial`, Hopper's tiles add them in the same
+  /// order in clusters of up to kMaxCluster blocks.
   int n_split;
   float* partial;
   Epilogue end;
@@ -126,7 +126,7 @@ inline Launch hopper_linear_bf16(const HopperTile& tile, const LinearBf16Job& jo
            static_cast<unsigned>(job.n_split)},
           static_cast<unsigned>(tile.columns) * 2,
           static_cast<unsigned>(hopper_stages(tile.columns, tile.rows) * hopper_stage_bytes(tile.columns, tile.rows)),
-          static_cast<unsigned>(job.n_split)};
+          cluster_of(job)};
 }
 /// Several products of the same rows, depth and number of shares, without gates.
 inline Launch hopper_linears_bf16(const HopperTile& tile, Several<LinearBf16Job>& jobs) {
@@ -138,6 +138,10 @@ inline Launch hopper_linears_bf16(const HopperTile& tile, Several<LinearBf16Job>
 
 inline Launch finish_bf16_partial(const LinearBf16Job& job) {
   return {"linear_bf16_finish", {blocks(job.n_column, 512), static_cast<unsigned>(job.n_row)}, 128};
+}
+inline Launch finish_bf16_partials(Several<LinearBf16Job>& jobs) {
+  const unsigned n_block = fill_ends(jobs, [](const LinearBf16Job& one) { return finish_bf16_partial(one).grid.x; });
+  return {"linear_bf16_finishes", {n_block, static_cast<unsigned>(jobs.job[0].n_row)}, 128};
 }
 
 }  // namespace vla::cuda

@@ -39,8 +39,8 @@ struct LinearInt8Job {
   std::int64_t x_stride;
   int n_row, n_column, depth;  // depth: a multiple of 64
   /// With more than one split, each writes its sums over a share of the depth to partial [n_column, n_row, n_split];
-  /// `finish_int8_partial` computes y from them. Sums are integers, so the bits stay the same. Hopper's tiles add them
-  /// in clusters of up to kMaxCluster blocks instead, and have no use for `partial`.
+  /// `finish_int8_partial` computes y from them. Sums are integers, so the bits stay the same. Without `partial`,
+  /// Hopper's tiles add them in clusters of up to kMaxCluster blocks.
   int n_split;
   int* partial;
   Epilogue end;
@@ -105,7 +105,7 @@ inline Launch hopper_linear_int8(const HopperInt8Tile& tile, const LinearInt8Job
           {blocks(job.n_row, tile.rows), blocks(job.n_column, tile.columns), static_cast<unsigned>(job.n_split)},
           static_cast<unsigned>(tile.columns) * 2,
           static_cast<unsigned>(hopper_int8_shared(tile.kind, tile.columns, tile.rows)),
-          static_cast<unsigned>(job.n_split)};
+          cluster_of(job)};
 }
 
 inline Launch finish_int8_partial(const LinearInt8Job& job) {

@@ -30,6 +30,7 @@ struct ProductCut {
   cuda::Bf16Shape shape = cuda::Bf16Shape::few;  // also of codes: few or rowsN; with a Hopper tile rows128
   int n_split = 1;                               // shares of the depth, each with its own blocks
   std::optional<std::size_t> tile = {};          // of Hopper: index into kHopperTiles or kHopperInt8Tiles
+  bool in_cluster = false;                       // of Hopper: a cluster's blocks add the shares
   double us = 0;                                 // estimated time on Hopper
 };
 /// How attention is cut into blocks of query rows and shares of the keys.
@@ -44,7 +45,7 @@ struct CudaOp : Step {
   ProductCut cut = {};      // LinearOp only
   AttentionPlan plan = {};  // AttentionOp only
   ValueId gate = kNone;     // the gate product's result, if no kernel computes gate and up together
-  ValueId partial = kNone;  // partial results of the shares of the depth or of the keys; none of Hopper tiles
+  ValueId partial = kNone;  // partial results of the shares of the depth or of the keys; none of a cluster
   std::shared_ptr<const CudaOp> finishes = nullptr;  // norms only: the product whose depth shares are added first
 };
 /// Whether another operation adds the depth shares of this product.

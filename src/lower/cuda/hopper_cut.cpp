@@ -16,13 +16,13 @@ struct ProductRates {
   double of_sm;          // bytes that an SM reads from the L2 cache
   double least;          // minimum time of a step of the depth
   double kernel, block;  // fixed costs of the kernel and of a block
-  double first_end;      // once: fetching the epilogue's instructions
-  double end;            // per result of a block
+  double first_end;      // once for blocks that write results: fetching the epilogue's instructions
+  double end, share;     // per result of a block, and per partial sum of a depth share
   double further;        // the fraction of a block's time that each further block on an SM adds
 };
 // Fitted to measurements on an H200: bf16 to 930 products of 50 to 2048 rows with float32 results, int8 to 194 and
-// ternary to 408, where another kernel added the shares of a split depth; 96, 96 and 89 % of the estimates were within
-// a sixth of the measurement, and the chosen tile took at most 1.19 times as long as the best one.
+// ternary to 408; 96, 96 and 89 % of the estimates are within a sixth of the measurement. The chosen tile takes at most
+// 1.19 times as long as the best one.
 constexpr ProductRates kBf16 = {.sums = 42.7e3,
                                 .of_sm = 67.1e3,
                                 .least = 0.267,
@@ -30,6 +30,7 @@ constexpr ProductRates kBf16 = {.sums = 42.7e3,
                                 .block = 0.44,
                                 .first_end = 0,
                                 .end = 1.46e-4,
+                                .share = 5.1e-5,
                                 .further = 0.97};
 constexpr ProductRates kTernary = {.sums = 34.2e3,
                                    .of_sm = 65e3,
@@ -38,6 +39,7 @@ constexpr ProductRates kTernary = {.sums = 34.2e3,
                                    .block = 0.03,
                                    .first_end = 0.2,
                                    .end = 2.6e-4,
+                                   .share = 9e-6,
                                    .further = 1.21};
 constexpr ProductRates kInt8 = {.sums = 51.6e3,
                                 .of_sm = 52.6e3,
@@ -46,15 +48,26 @@ constexpr ProductRates kInt8 = {.sums = 51.6e3,
                                 .block = 0.13,
                                 .first_end = 0.35,
                                 .end = 3.4e-4,
+                                .share = 3.5e-5,
                                 .further = 1.18};
+constexpr double kWritten = 2.5e6;  // bytes that all SMs together write to memory per microsecond
 // Clusters, whose blocks add shares. All three are assumed and not measured.
 constexpr double kCluster = 1.2;    // microseconds of both barriers and of the first read of another block
 constexpr double kOfOthers = 20e3;  // bytes that an SM reads from other blocks' shared memory per microsecond
 constexpr int kGroupOfSms = 16;     // a cluster's SMs are of one such group
 /// SMs that clusters of this many blocks can keep busy.
 int usable_sms(int n_sm, int n_block) {
-  return n_sm / kGroupOfSms * (kGroupOfSms / n_block * n_block) + n_sm % kGroupOfSms / n_block * n_block;
+  const int n = n_sm / kGroupOfSms * (kGroupOfSms / n_block * n_block) + n_sm % kGroupOfSms / n_block * n_block;
+  return std::max(n, n_block);
 }
+
+/// Shares of the depth, and whether a cluster's blocks add them or another kernel does.
+struct Split {
+  int n_split;
+  bool in_cluster;
+};
+constexpr Split kSplits[] = {{1, false}, {2, false}, {2, true}, {3, false}, {3, true}, {4, false},
+                             {4, true},  {6, false}, {6, true}, {8, false}, {8, true}};
 
 /// A tile of a table, and the bytes that it reads per step of 128 bytes of depth.
 struct Candidate {
@@ -89,7 +102,7 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
   const ProductRates& rates = is_bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
   ProductCut best = {.shape = cuda::Bf16Shape::rows128, .us = std::numeric_limits<double>::max()};
   for (const Candidate& tile : candidates(kind, what))
-    for (const int n_split : {1, 2, 3, 4, 6, 8}) {
+    for (const auto& [n_split, in_cluster] : kSplits) {
       // The measured range: a share has at least 4 steps, or for codes 1 step with up to 4 shares. Products of codes
       // are not split further than about twice the SMs can use.
       const std::int64_t n_whole = ceil_div(n_row, tile.rows) * ceil_div(n_column, tile.columns);
@@ -98,17 +111,21 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
       const auto size = static_cast<double>(tile.columns * tile.rows);
       const std::int64_t n_of_y = what == HopperCutFor::gated ? tile.columns / 2 : tile.columns;
       const auto n_used = static_cast<double>(std::min(tile.rows, n_row));
-      const double n_result = static_cast<double>(n_of_y) * n_used / n_split;
+      const double n_finished = static_cast<double>(n_of_y) * n_used / n_split;
       const double of_step =
           std::max({size / rates.sums, static_cast<double>(tile.step_bytes) / rates.of_sm, rates.least});
-      double of_block = rates.block + static_cast<double>(ceil_div(n_step, n_split)) * of_step + rates.first_end +
-                        rates.end * n_result;
+      double of_block = rates.block + static_cast<double>(ceil_div(n_step, n_split)) * of_step;
+      if (n_split == 1 || in_cluster)
+        of_block += rates.first_end + rates.end * n_finished;
+      else
+        of_block += rates.share * size;
       const double n_read = static_cast<double>(tile.columns) * n_used / n_split * (n_split - 1);  // of other blocks
-      if (n_split > 1) of_block += kCluster + 4 * n_read / kOfOthers;
-      const auto n_wave =
-          static_cast<double>(ceil_div(n_whole * n_split, std::max(usable_sms(n_sm, n_split), n_split)));
-      const double us = rates.kernel + of_block * (1 + rates.further * (n_wave - 1));
-      if (us < best.us) best.n_split = n_split, best.tile = tile.index, best.us = us;
+      if (in_cluster) of_block += kCluster + 4 * n_read / kOfOthers;
+      const int n_usable = in_cluster ? usable_sms(n_sm, n_split) : n_sm;
+      const auto n_wave = static_cast<double>(ceil_div(n_whole * n_split, n_usable));
+      double us = rates.kernel + of_block * (1 + rates.further * (n_wave - 1));
+      if (n_split > 1 && !in_cluster) us += static_cast<double>(4 * n_row * n_column * (n_split + 1)) / kWritten;
+      if (us < best.us) best.n_split = n_split, best.tile = tile.index, best.in_cluster = in_cluster, best.us = us;
     }
   return best;
 }

@@ -35,7 +35,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     std::erase_if(l.ops, [](const CudaOp& op) { return op.writes.empty(); });
     for (std::size_t i = 0; i < l.ops.size(); ++i) cut_together(i);
     for (CudaOp& op : l.ops)
-      if (const auto* product = std::get_if<LinearOp>(&op.op); product != nullptr && !op.cut.tile)
+      if (const auto* product = std::get_if<LinearOp>(&op.op); product != nullptr && !op.cut.in_cluster)
         split(op, op.cut.n_split, n_sum(op, *product));
     for (CudaOp& op : l.ops)
       if (const auto* round = std::get_if<RoundOp>(&op.op)) finish_in_norm(op, *round);
@@ -265,8 +265,8 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
   if (is_bf16 && is_of_strips(n_row, depth)) {
     const ProductCut strips = cut_in_strips(n_row, n_column, depth, n_sm);
     if (!has_tiles) return strips;
-    // Measured with another kernel that added shares, and assumed of clusters: tiles of few rows take this many
-    // microseconds more than estimated.
+    // Measured: tiles of few rows, with the kernel that adds their shares, take this many microseconds more than
+    // estimated.
     constexpr double kMore = 1.5;
     const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
     return tiles.us + kMore < strips.us ? tiles : strips;

@@ -25,11 +25,13 @@ bool is_strip(const Calls& calls) {
   return job.n_split == 1 && job.gate_weight == nullptr;
 }
 bool is_heads(const Calls& calls) { return calls.size() == 1 && calls[0].how.kernel == std::string_view("head_rows"); }
-/// The Hopper tile of a bf16 product, if a kernel computes several products with this tile; else null.
+/// The Hopper tile of a bf16 product, if a kernel computes several products with this tile and no other operation adds
+/// the product's shares; else null.
 const cuda::HopperTile* tile_of(const Calls& calls) {
   const std::string_view kernel = calls[0].how.kernel;
   const auto* tile = std::ranges::find(cuda::kHopperTiles, kernel, &cuda::HopperTile::kernel);
-  return tile != std::end(cuda::kHopperTiles) && tile->several != nullptr ? tile : nullptr;
+  if (tile == std::end(cuda::kHopperTiles) || tile->several == nullptr) return nullptr;
+  return (job_of<cuda::LinearBf16Job>(calls[0]).partial != nullptr) == (calls.size() == 2) ? tile : nullptr;
 }
 
 /// Merges operations for which `fits` holds and that agree with the first one (`agrees`), up to kMostJobs at a time.
@@ -52,10 +54,11 @@ void merge(std::vector<Calls>& phase, Fits fits, Agrees agrees, Merged merged) {
   }
 }
 
-/// Whether two products have the same rows, depth and number of shares.
+/// Whether two products have the same rows, depth and shares.
 bool are_alike(const Calls& a, const Calls& b) {
   const auto one = job_of<cuda::LinearBf16Job>(a[0]), other = job_of<cuda::LinearBf16Job>(b[0]);
-  return one.n_row == other.n_row && one.depth == other.depth && one.n_split == other.n_split;
+  return one.n_row == other.n_row && one.depth == other.depth && one.n_split == other.n_split &&
+         (one.partial == nullptr) == (other.partial == nullptr);
 }
 
 }  // namespace
@@ -73,8 +76,12 @@ void merge_calls(std::vector<Calls>& phase, int n_sm) {
       phase, [](const Calls& calls) { return tile_of(calls) != nullptr; },
       [](const Calls& a, const Calls& b) { return tile_of(a) == tile_of(b) && are_alike(a, b); },
       [](const Calls& first, Products& jobs) {
-        const cuda::Launch how = cuda::hopper_linears_bf16(*tile_of(first), jobs);
-        return Calls{call(how, jobs)};
+        const cuda::Launch product = cuda::hopper_linears_bf16(*tile_of(first), jobs);
+        Calls calls = {call(product, jobs)};
+        if (jobs.job[0].partial == nullptr) return calls;
+        const cuda::Launch finish = cuda::finish_bf16_partials(jobs);
+        calls.push_back(call(finish, jobs));
+        return calls;
       });
   merge<cuda::HeadJob>(
       phase, is_heads, [](const Calls&, const Calls&) { return true; },

@@ -126,27 +126,30 @@ class Bench {
         if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
         VLA_CHECK(tell("bf16", size, name, n_split, jobs, launches));
       }
-    if (timer_.gpu().is_hopper() && size.n_row > 32) return run_hopper(size, x, matrices, end);
+    if (timer_.gpu().is_hopper() && size.n_row > 32) return run_hopper(size, x, matrices, partial, end);
     return {};
   }
 
-  Status run_hopper(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Epilogue& end) {
+  Status run_hopper(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Buffer& partial,
+                    const Epilogue& end) {
     const std::int64_t stride = round_up(size.depth, 8);
     VLA_TRY(const Buffer bias, timer_.upload(numbers_.floats(size.n_column)));
     for (const HopperTile& tile : kHopperTiles)
-      for (const int n_split : {1, 2, 3, 4, 6, 8}) {
+      for (const auto& [n_split, in_cluster] : kHopperSplits) {
         // Both matrices of a gated product, each of half of the columns, are as much work.
         if (!is_worth(size, tile.columns, tile.rows, n_split) || (tile.is_gated && size.n_column % 2 != 0)) continue;
         std::vector<LinearBf16Job> jobs;
         for (const Buffer& matrix : matrices) {
           const int n_column = tile.is_gated ? size.n_column / 2 : size.n_column;
           const auto* weight = matrix.as<std::uint16_t>();
-          jobs.push_back(
-              {x.as<void>(), weight, stride, stride, size.n_row, n_column, size.depth, n_split, nullptr, end});
+          jobs.push_back({x.as<void>(), weight, stride, stride, size.n_row, n_column, size.depth, n_split,
+                          n_split > 1 && !in_cluster ? partial.as<float>() : nullptr, end});
           if (tile.is_gated) jobs.back().gate_weight = weight + n_column * stride;
         }
-        const std::vector<Launch> launches = {hopper_linear_bf16(tile, jobs[0])};
-        VLA_CHECK(tell(tile.is_gated ? "bf16 gated" : "bf16", size, tile.kernel, n_split, jobs, launches));
+        std::vector<Launch> launches = {hopper_linear_bf16(tile, jobs[0])};
+        if (jobs[0].partial != nullptr) launches.push_back(finish_bf16_partial(jobs[0]));
+        const std::string name = shape_name(tile.kernel, in_cluster);
+        VLA_CHECK(tell(tile.is_gated ? "bf16 gated" : "bf16", size, name.c_str(), n_split, jobs, launches));
         if (tile.is_gated || n_split > 1 || size.n_row <= 64) continue;
         // What a vision tower's first product of an MLP ends in.
         for (LinearBf16Job& job : jobs)
@@ -177,17 +180,26 @@ class Bench {
       }
     if (!timer_.gpu().is_hopper() || size.n_row <= 32) return {};
     for (const HopperInt8Tile& tile : kHopperInt8Tiles)
-      for (const int n_split : {1, 2, 3, 4, 6, 8}) {
+      for (const auto& [n_split, in_cluster] : kHopperSplits) {
         if (tile.kind != code || !is_worth(size, tile.columns, tile.rows, n_split)) continue;
         std::vector<LinearInt8Job> jobs;
         for (const Buffer& matrix : matrices)
           jobs.push_back({x.as<std::byte>(), matrix.as<std::byte>(), scale.as<float>(), stride, size.n_row,
-                          size.n_column, static_cast<int>(kernels::quantized_depth(size.depth)), n_split, nullptr,
-                          end});
-        const std::vector<Launch> launches = {hopper_linear_int8(tile, jobs[0])};
-        VLA_CHECK(tell(kind, size, tile.kernel, n_split, jobs, launches));
+                          size.n_column, static_cast<int>(kernels::quantized_depth(size.depth)), n_split,
+                          n_split > 1 && !in_cluster ? partial.as<int>() : nullptr, end});
+        std::vector<Launch> launches = {hopper_linear_int8(tile, jobs[0])};
+        if (jobs[0].partial != nullptr) launches.push_back(finish_int8_partial(jobs[0]));
+        const std::string name = shape_name(tile.kernel, in_cluster);
+        VLA_CHECK(tell(kind, size, name.c_str(), n_split, jobs, launches));
       }
     return {};
+  }
+  /// Shares of the depth, and whether the blocks of a cluster add them or another kernel does.
+  static constexpr std::pair<int, bool> kHopperSplits[] = {{1, false}, {2, false}, {2, true}, {3, false},
+                                                           {3, true},  {4, false}, {4, true}, {6, false},
+                                                           {6, true},  {8, false}, {8, true}};
+  static std::string shape_name(const char* kernel, bool in_cluster) {
+    return std::string(kernel) + (in_cluster ? " in clusters" : "");
   }
   /// Whether SMs that would have nothing to do take part in a split, and each share has a step.
   bool is_worth(const Size& size, int columns, int rows, int n_split) {

@@ -20,7 +20,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                  const cuda::Epilogue& end, const op::Linear* gate, Calls& calls) {
   const Value& x = l.value(of);
   const int rows = narrow(rows_of(x.shape)), columns = narrow(weight.shape[1]), depth = narrow(x.shape[0]);
-  const auto [shape, n_split, tile, us] = op.cut;
+  const auto [shape, n_split, tile, in_cluster, us] = op.cut;
   switch (matrix.kind) {
     case MatrixKind::f32: {
       const cuda::LinearF32Job job = {.x = l.at(of),
