@@ -204,7 +204,8 @@ TEST_CASE("int8 products in tiles for Hopper are equal to the same bits") {
       for (const HopperInt8Tile& tile : kHopperInt8Tiles) {
         if (tile.kind != kind) continue;
         INFO(tile.kernel, ", ", c.n_row, " x ", c.d_in, " x ", c.d_out);
-        in_every_schedule([&] { CHECK(same(trial.run(tile, true), expected)); });
+        in_two_schedules(static_cast<std::size_t>((&c - kHopperCases) + (&tile - kHopperInt8Tiles)),
+                         [&] { CHECK(same(trial.run(tile, true), expected)); });
         if (c.n_split == 1) continue;
         schedule = {7, false};
         CHECK(same(trial.run(tile, false), expected));

@@ -53,11 +53,21 @@ class Device {
   T* data_;
 };
 
+constexpr Schedule kSchedules[] = {{0, true}, {0, false}, {1, true}, {7, false}};
 /// Runs `test` in each schedule of threads and copies.
 template <class Test>
 void in_every_schedule(Test test) {
-  for (const Schedule& one : {Schedule{0, true}, Schedule{0, false}, Schedule{1, true}, Schedule{7, false}}) {
+  for (const Schedule& one : kSchedules) {
     schedule = one;
+    test();
+  }
+  schedule = {};
+}
+/// The same in two of them, which `number` chooses: numbers that follow each other try all.
+template <class Test>
+void in_two_schedules(std::size_t number, Test test) {
+  for (const std::size_t i : {number, number + 1}) {
+    schedule = kSchedules[i % std::size(kSchedules)];
     test();
   }
   schedule = {};
