@@ -17,6 +17,7 @@
 #include "support/kernel_rows.h"
 #include "support/product.h"
 #include "support/stored.h"
+#include "support/unwatched.h"
 
 namespace int8_test {
 
@@ -121,9 +122,7 @@ Matrix extreme_matrix(DType weights, bool largest, std::int64_t d_in, std::int64
   return matrix;
 }
 
-/// Not watched by sanitizers, whose checks take ten times as long as the products.
-__attribute__((no_sanitize("address", "undefined"))) int sum_of_products(const int* codes, const float* weights,
-                                                                         std::int64_t n) {
+VLA_UNWATCHED int sum_of_products(const int* codes, const float* weights, std::int64_t n) {
   int sum = 0;
   for (std::int64_t k = 0; k < n; ++k) sum += codes[k] * static_cast<int>(weights[k]);
   return sum;

@@ -14,6 +14,7 @@
 #include "support/kernel_rows.h"
 #include "support/product.h"
 #include "support/stored.h"
+#include "support/unwatched.h"
 
 namespace linear_test {
 
@@ -78,9 +79,7 @@ std::byte* bytes(std::vector<float>& values) { return reinterpret_cast<std::byte
 struct Sum {
   double value, size;
 };
-/// Not watched by sanitizers, whose checks take ten times as long as the products.
-__attribute__((no_sanitize("address", "undefined"))) Sum add_products(Sum sum, const float* x, const float* w,
-                                                                      std::int64_t n) {
+VLA_UNWATCHED Sum add_products(Sum sum, const float* x, const float* w, std::int64_t n) {
   for (std::int64_t k = 0; k < n; ++k) {
     const double term = double{x[k]} * w[k];
     sum.value += term, sum.size += __builtin_fabs(term);

@@ -14,12 +14,11 @@
 #include <cstdlib>
 #include <cstring>
 
+#include "support/unwatched.h"
+
 /// For what kernels unroll: calls compile in a third of the time that a copy in every place takes. Arguments are
 /// references, because GCC 12 does not align vectors that a machine without the registers is given on the stack.
 #define VLA_CALLED __attribute__((noinline)) inline
-/// For what touches registers alone: sanitizers watch loads and stores, which take a tenth of the time. It calls
-/// builtins, since functions that are watched are not inlined in it.
-#define VLA_UNWATCHED __attribute__((no_sanitize("address", "undefined")))
 
 namespace vla::test::avx512 {
 
