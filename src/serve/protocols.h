@@ -24,9 +24,9 @@ struct Protocol {
 
   bool is_wanted(const ServerOptions& options) const { return address == nullptr || !(options.*address).empty(); }
 };
-template <class Protocol>
+template <class FrontEnd>
 Result<std::unique_ptr<Front>> open_front(net::Loop& loop, const ServerOptions& options) {
-  VLA_TRY(std::unique_ptr<Front> front, Protocol::open(loop, options));
+  VLA_TRY(std::unique_ptr<Front> front, FrontEnd::open(loop, options));
   return front;
 }
 
