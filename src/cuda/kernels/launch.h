@@ -33,6 +33,13 @@ constexpr unsigned kMaxShared = 99 << 10;
 constexpr unsigned kHopperShared = 227 << 10;
 /// Most blocks of a cluster on every Hopper.
 constexpr unsigned kMaxCluster = 8;
+/// How a product in Hopper's tiles may split its depth: the number of shares, and whether a cluster adds them.
+struct HopperSplit {
+  int n_split;
+  bool in_cluster;
+};
+constexpr HopperSplit kHopperSplits[] = {{1, false}, {2, false}, {2, true}, {3, false}, {3, true}, {4, false},
+                                         {4, true},  {6, false}, {6, true}, {8, false}, {8, true}};
 /// The cluster of a product in Hopper's tiles: its shares of the depth, unless they go to partial sums.
 template <class Job>
 unsigned cluster_of(const Job& job) {

@@ -61,14 +61,6 @@ int usable_sms(int n_sm, int n_block) {
   return std::max(n, n_block);
 }
 
-/// Shares of the depth, and whether a cluster's blocks add them or another kernel does.
-struct Split {
-  int n_split;
-  bool in_cluster;
-};
-constexpr Split kSplits[] = {{1, false}, {2, false}, {2, true}, {3, false}, {3, true}, {4, false},
-                             {4, true},  {6, false}, {6, true}, {8, false}, {8, true}};
-
 /// A tile of a table, and the bytes that it reads per step of 128 bytes of depth.
 struct Candidate {
   std::size_t index;
@@ -102,7 +94,7 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
   const ProductRates& rates = is_bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
   ProductCut best = {.shape = cuda::Bf16Shape::rows128, .us = std::numeric_limits<double>::max()};
   for (const Candidate& tile : candidates(kind, what))
-    for (const auto& [n_split, in_cluster] : kSplits) {
+    for (const auto& [n_split, in_cluster] : cuda::kHopperSplits) {
       // The measured range: a share has at least 4 steps, or for codes 1 step with up to 4 shares. Products of codes
       // are not split further than about twice the SMs can use.
       const std::int64_t n_whole = ceil_div(n_row, tile.rows) * ceil_div(n_column, tile.columns);

@@ -194,10 +194,6 @@ class Bench {
       }
     return {};
   }
-  /// Shares of the depth, and whether the blocks of a cluster add them or another kernel does.
-  static constexpr std::pair<int, bool> kHopperSplits[] = {{1, false}, {2, false}, {2, true}, {3, false},
-                                                           {3, true},  {4, false}, {4, true}, {6, false},
-                                                           {6, true},  {8, false}, {8, true}};
   static std::string shape_name(const char* kernel, bool in_cluster) {
     return std::string(kernel) + (in_cluster ? " in clusters" : "");
   }
