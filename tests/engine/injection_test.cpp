@@ -9,6 +9,7 @@
 #include <regex>
 
 #include "kernels/kernel_set.h"
+#include "support/editable_bundle.h"
 #include "support/golden_case.h"
 
 namespace injection_test {
@@ -106,7 +107,7 @@ TEST_CASE("avx2" VLA_PARTS* doctest::skip(lacks(kernel_set::avx2))) { check_part
 TEST_CASE("avx512" VLA_PARTS* doctest::skip(lacks(kernel_set::avx512))) { check_parts("avx512"); }
 
 TEST_CASE("a chunk follows from injected values, in every family, on all kernels") {
-  for (const std::string& path : some_golden_paths()) {
+  for (const std::string& path : some_of(golden_paths())) {
     CAPTURE(path);
     const GoldenCase golden = GoldenCase::read(path);
     const std::vector<Tap> all = golden.expected();
@@ -132,7 +133,7 @@ TEST_CASE("a chunk follows from injected values, in every family, on all kernels
 
 TEST_CASE("values of a step are injected step by step") {
   int n_case = 0;
-  for (const std::string& path : some_golden_paths()) {
+  for (const std::string& path : some_of(golden_paths())) {
     CAPTURE(path);
     const GoldenCase golden = GoldenCase::read(path);
     const std::vector<Tap> all = golden.expected();

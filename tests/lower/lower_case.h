@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cmath>
+#include <cstdlib>
 #include <string>
 
 #include "kernels/kernel_set.h"
@@ -18,6 +19,16 @@ inline std::vector<KernelSet> lowered_kernels() {
   std::vector<KernelSet> sets = usable_kernels();
   std::erase(sets, kernel_set::ggml);
   return sets;
+}
+
+/// How many of `all` random graphs a test makes: a tenth under a sanitizer or on an emulated processor, where each
+/// takes long. The plain build makes all.
+inline unsigned some_random(unsigned all) {
+#ifdef __SANITIZE_ADDRESS__
+  return (all + 9) / 10;
+#else
+  return std::getenv("VLA_EMULATED") == nullptr ? all : (all + 9) / 10;
+#endif
 }
 
 /// The same numbers but for rounding: `tolerance` of the largest.

@@ -91,6 +91,17 @@ std::vector<std::string> golden_bundles() {
   return paths;
 }
 
+std::vector<std::string> some_of(const std::vector<std::string>& all) {
+#ifdef __SANITIZE_ADDRESS__
+  static std::size_t n_call = 0;
+  std::vector<std::string> some;
+  for (std::size_t i = n_call++ % 3; i < all.size(); i += 3) some.push_back(all[i]);
+  return some;
+#else
+  return all;
+#endif
+}
+
 std::string scratch_path(const std::string& file_name) {
   const auto folder = std::filesystem::temp_directory_path() / fmt::format("vla-test-{}", ::getpid());
   std::filesystem::create_directories(folder);

@@ -41,6 +41,8 @@ std::string source_path(const std::string& path);
 std::string golden_path(const std::string& name = "");
 /// The smallest golden bundle of each architecture.
 std::vector<std::string> golden_bundles();
+/// All of them, but under a sanitizer a third, and another third at the next call: for tests that compute each case.
+std::vector<std::string> some_of(const std::vector<std::string>& all);
 /// A place for files that a test writes.
 std::string scratch_path(const std::string& file_name);
 std::string write_file(const std::string& file_name, const std::string& bytes);

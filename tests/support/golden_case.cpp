@@ -58,18 +58,6 @@ std::vector<std::string> golden_paths() {
   return paths;
 }
 
-std::vector<std::string> some_golden_paths() {
-#ifdef __SANITIZE_ADDRESS__
-  static std::size_t n_call = 0;
-  const std::vector<std::string> all = golden_paths();
-  std::vector<std::string> some;
-  for (std::size_t i = n_call++ % 3; i < all.size(); i += 3) some.push_back(all[i]);
-  return some;
-#else
-  return golden_paths();
-#endif
-}
-
 std::unique_ptr<Engine> load_engine(const std::string& bundle, const std::string& taps, const std::string& kernels,
                                     const std::vector<Tap>& inject) {
   const int n_thread = threads_for(kernels, 2);

@@ -23,9 +23,6 @@ struct GoldenCase {
 
 /// Every case of every architecture, as `<arch>/<name>` folders.
 std::vector<std::string> golden_paths();
-/// The same, but under a sanitizer a third of them, and another third at the next call: for tests that compute each
-/// case.
-std::vector<std::string> some_golden_paths();
 
 /// A loaded engine; fails the test where loading fails.
 std::unique_ptr<Engine> load_engine(const std::string& bundle, const std::string& taps = "",
