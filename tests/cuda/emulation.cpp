@@ -38,6 +38,7 @@ struct Sums : WgmmaSums {
 struct Warp {
   Meeting* lanes[kWarp] = {};
   int n_here = 0;
+  Meeting::Kind kind = Meeting::kSync;  // of those that are here
   Wgmma wgmma = {};
   std::list<Sums> sums = {};  // in flight
 };
@@ -305,8 +306,8 @@ void meet(Meeting& mine) {
   Block& block = own_block();
   Warp& warp = own_warp();
   const int lane = lane_index(), first = cluster.self->number - lane;
-  for (const Meeting* other : warp.lanes)
-    if (other != nullptr && other->kind != mine.kind) fault("lanes of a warp came to different instructions");
+  if (warp.n_here == 0) warp.kind = mine.kind;
+  if (warp.kind != mine.kind) fault("lanes of a warp came to different instructions");
   warp.lanes[lane] = &mine;
   if (++warp.n_here == kWarp) {
     Meeting* lanes[kWarp];

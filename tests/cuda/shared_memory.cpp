@@ -30,13 +30,11 @@ void SharedMemory::begin(std::size_t size, int n_thread) {
 }
 
 void SharedMemory::check_range(std::size_t offset, std::size_t size) const {
-  if (offset % size != 0) throw Fault("address in shared memory is not aligned");
+  if ((offset & (size - 1)) != 0) throw Fault("address in shared memory is not aligned");
   if (offset >= size_ || offset + size > size_) throw Fault("address is not in shared memory");
 }
 
-/// Whether an event is over for a thread: its own, or with a barrier in between.
-bool SharedMemory::ordered(const Event& event, int thread) const {
-  if (event.thread == kNobody || event.time < time_) return true;
+bool SharedMemory::ordered_without_barrier(const Event& event, int thread) const {
   if (event.time == kPending || event.thread == kMany) return false;
   if (event.thread == thread) return true;
   const int warp = event.thread >= kManyOfWarp ? event.thread - kManyOfWarp : event.thread / kWarp;
@@ -130,23 +128,27 @@ void SharedMemory::arrive(const Copy& copy, int thread) {
 
 void SharedMemory::fence_async(int thread) { fences_[static_cast<std::size_t>(thread)].push_back(time_); }
 
-void SharedMemory::async_read(std::size_t offset, std::size_t size, int warp, std::uint32_t group) {
-  check_range(offset, size);
+void SharedMemory::async_read(std::size_t offset, int warp, std::uint32_t group) {
+  check_range(offset, kAsyncRead);
   const auto of_warp = static_cast<std::size_t>(warp);
   if (of_warp >= kMostWarps) throw Fault("more warps than a block may have");
-  async_readers_.resize((size_ + 3) / 4);
+  async_readers_.resize((size_ + kAsyncRead - 1) / kAsyncRead);
   async_done_[of_warp].resize(group + 1, kPending);
-  for (std::size_t i = offset / 4; i < (offset + size) / 4; ++i) {
-    const Event& write = words_[i].write;
-    async_readers_[i][of_warp] = group + 1;
-    if (write.thread == kNobody || write.time < begin_time_) continue;
-    if (write.time == kPending) throw Fault("wgmma reads what an asynchronous copy has not brought");
-    if (!ordered(write, warp * kWarp)) throw Fault("race in shared memory: wgmma reads what another thread writes");
-    const auto& fences = fences_[static_cast<std::size_t>(write.thread)];
-    const bool is_own = write.thread / kWarp == warp;
-    if (fences.size() <= write.n_fence || (!is_own && fences[write.n_fence] >= time_))
-      throw Fault("wgmma reads what no fence.proxy.async has made visible");
-  }
+  async_readers_[offset / kAsyncRead][of_warp] = group + 1;
+  const Word* const first = &words_[offset / 4];
+  for (const Word* word = first; word != first + kAsyncRead / 4; ++word)
+    if (word == first || word->write != word[-1].write) check_written(word->write, warp);
+}
+
+/// Whether a warp's asynchronous read may see what was written.
+void SharedMemory::check_written(const Event& write, int warp) const {
+  if (write.thread == kNobody || write.time < begin_time_) return;
+  if (write.time == kPending) throw Fault("wgmma reads what an asynchronous copy has not brought");
+  if (!ordered(write, warp * kWarp)) throw Fault("race in shared memory: wgmma reads what another thread writes");
+  const auto& fences = fences_[static_cast<std::size_t>(write.thread)];
+  const bool is_own = write.thread / kWarp == warp;
+  if (fences.size() <= write.n_fence || (!is_own && fences[write.n_fence] >= time_))
+    throw Fault("wgmma reads what no fence.proxy.async has made visible");
 }
 
 void SharedMemory::async_done(int warp, std::uint32_t group) {
@@ -157,7 +159,7 @@ void SharedMemory::async_done(int warp, std::uint32_t group) {
 
 void SharedMemory::check_async_readers(std::size_t word, int thread) const {
   for (std::size_t warp = 0; warp < async_done_.size(); ++warp) {
-    const std::uint32_t group = async_readers_[word][warp];
+    const std::uint32_t group = async_readers_[word * 4 / kAsyncRead][warp];
     if (group == 0) continue;
     const std::uint64_t done = async_done_[warp][group - 1];
     const bool is_own = warp == static_cast<std::size_t>(thread / kWarp);

@@ -56,9 +56,9 @@ class SharedMemory {
 
   /// Makes what a thread wrote visible to asynchronous reads, which need a barrier after it besides.
   void fence_async(int thread);
-  /// A warp's asynchronous read in a group of such, which are numbered from 0 in each block. Nobody may write there
-  /// before the warp has waited for the group, and another warp not before a barrier after that.
-  void async_read(std::size_t offset, std::size_t size, int warp, std::uint32_t group);
+  /// A warp's asynchronous read of 16 bytes in a group of such, which are numbered from 0 in each block. Nobody may
+  /// write there before the warp has waited for the group, and another warp not before a barrier after that.
+  void async_read(std::size_t offset, int warp, std::uint32_t group);
   void async_done(int warp, std::uint32_t group);
 
   /// Counts what lanes wait for each other when they access `width` bytes at each offset: those of one bank, but for
@@ -71,6 +71,7 @@ class SharedMemory {
     int thread = -1;  // or, of readers, one of the values below
     std::uint64_t time = 0, warp_time = 0;
     std::size_t n_fence = 0;  // of that thread before it
+    bool operator==(const Event&) const = default;
   };
   struct Word {
     Event write, read;
@@ -81,11 +82,17 @@ class SharedMemory {
     std::size_t size;
   };
   static constexpr int kNobody = -1, kManyOfWarp = 1 << 20, kMany = 1 << 21;
-  static constexpr std::size_t kMostWarps = 32;
+  static constexpr std::size_t kMostWarps = 32, kAsyncRead = 16;
   static constexpr std::uint64_t kPending = ~std::uint64_t{0};
 
+  /// size: a power of two.
   void check_range(std::size_t offset, std::size_t size) const;
-  bool ordered(const Event& event, int thread) const;
+  /// Whether an event is over for a thread: its own, or with a barrier in between.
+  bool ordered(const Event& event, int thread) const {
+    return event.thread == kNobody || event.time < time_ || ordered_without_barrier(event, thread);
+  }
+  bool ordered_without_barrier(const Event& event, int thread) const;
+  void check_written(const Event& write, int warp) const;
   void check_async_readers(std::size_t word, int thread) const;
   void check_other_readers(std::size_t word) const;
   Event now(int thread) const {
@@ -102,7 +109,7 @@ class SharedMemory {
   std::uint64_t begin_time_ = 1;
   std::vector<std::vector<std::uint64_t>> fences_;                    // of each thread: their times
   std::vector<std::vector<std::uint64_t>> async_done_;                // of each warp and group: its time
-  std::vector<std::array<std::uint32_t, kMostWarps>> async_readers_;  // of each word and warp: the last group, from 1
+  std::vector<std::array<std::uint32_t, kMostWarps>> async_readers_;  // of 16 bytes and a warp: the last group, from 1
   std::vector<std::uint64_t> others_read_;    // of each word, when another block read it; empty until one has
   std::uint64_t cluster_time_ = 1;            // after the cluster's last barrier that released
   bool is_read_ = false, has_ended_ = false;  // is_read_: by another block since the cluster's last barrier

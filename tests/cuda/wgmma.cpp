@@ -75,47 +75,57 @@ void Wgmma::end() const {
 void Wgmma::read(const Product& product) const {
   const Operand a(product.a), b(product.b);
   for (int which = 0; which < static_cast<int>(kDepthBytes / kChunk); ++which) {
-    for (int row = 0; row < 16; ++row)
-      shared_->async_read(a.chunk(warp_ % 4 * 16 + row, which), kChunk, warp_, n_group_);
-    for (int row = 0; row < product.n; ++row) shared_->async_read(b.chunk(row, which), kChunk, warp_, n_group_);
+    for (int row = 0; row < 16; ++row) shared_->async_read(a.chunk(warp_ % 4 * 16 + row, which), warp_, n_group_);
+    for (int row = 0; row < product.n; ++row) shared_->async_read(b.chunk(row, which), warp_, n_group_);
   }
 }
 
 /// As mma_bf16 and mma_s8 (fragments.h): products are exact, and added in float32 one after the other, or exactly.
+template <int kDepth>
 void Wgmma::compute(const Product& product) const {
-  const Operand a(product.a), b(product.b);
-  const auto load = [&](const Operand& from, int row, auto& to) {
+  constexpr bool kIsBf16 = kDepth == 16;
+  using Eight [[gnu::vector_size(32)]] = float;  // a number of each row
+  const auto load = [&](const Operand& from, int row, float(&to)[kDepth]) {
     std::uint8_t bytes[kDepthBytes];
     for (int which = 0; which < 2; ++which)
       std::memcpy(bytes + which * 16, shared_->data() + from.chunk(row, which), kChunk);
-    for (int k = 0; k < product.depth(); ++k) {
+    for (int k = 0; k < kDepth; ++k) {
       std::uint16_t half = 0;
-      if (product.kind == WgmmaProduct::bf16) std::memcpy(&half, bytes + 2 * k, 2);
-      to[k] = product.kind == WgmmaProduct::bf16 ? bf16_to_float(half)
-                                                 : static_cast<float>(static_cast<std::int8_t>(bytes[k]));
+      if (kIsBf16) std::memcpy(&half, bytes + 2 * k, 2);
+      to[k] = kIsBf16 ? bf16_to_float(half) : static_cast<float>(static_cast<std::int8_t>(bytes[k]));
     }
   };
-  float rows[16][kDepthBytes];
-  for (int row = 0; row < 16; ++row) load(a, warp_ % 4 * 16 + row, rows[row]);
+  const Operand a(product.a), b(product.b);
+  Eight rows[kDepth][2];
+  float one[kDepth];
+  for (int row = 0; row < 16; ++row) {
+    load(a, warp_ % 4 * 16 + row, one);
+    for (int k = 0; k < kDepth; ++k) rows[k][row / 8][row % 8] = one[k];
+  }
   for (int column = 0; column < product.n; ++column) {
-    float of_column[kDepthBytes];
-    load(b, column, of_column);
+    load(b, column, one);
+    Eight sum[2] = {};
+    std::uint32_t* to[16];
     for (int row = 0; row < 16; ++row) {
       // Register 4 j + 2 h + c of lane l is row l / 4 + 8 h, column 8 j + 2 (l % 4) + c.
       const auto lane = static_cast<std::size_t>(row % 8 * 4 + column % 8 / 2);
-      std::uint32_t& to = product.sums->of[static_cast<std::size_t>(column / 8 * 4 + row / 8 * 2 + column % 2)][lane];
-      if (!product.adds) to = 0;
-      if (product.kind == WgmmaProduct::bf16) {
-        auto sum = std::bit_cast<float>(to);
-        for (int k = 0; k < product.depth(); ++k) sum += rows[row][k] * of_column[k];
-        to = std::bit_cast<std::uint32_t>(sum);
-      } else {
-        float sum = 0;  // below 2^20, thus exact
-        for (int k = 0; k < product.depth(); ++k) sum += rows[row][k] * of_column[k];
-        to += static_cast<std::uint32_t>(static_cast<std::int32_t>(sum));
-      }
+      to[row] = &product.sums->of[static_cast<std::size_t>(column / 8 * 4 + row / 8 * 2 + column % 2)][lane];
+      if (!product.adds) *to[row] = 0;
+      if (kIsBf16) sum[row / 8][row % 8] = std::bit_cast<float>(*to[row]);
+    }
+    for (int k = 0; k < kDepth; ++k) sum[0] += rows[k][0] * one[k], sum[1] += rows[k][1] * one[k];
+    for (int row = 0; row < 16; ++row) {
+      const float of_row = sum[row / 8][row % 8];  // of codes below 2^20, thus exact
+      *to[row] = kIsBf16 ? std::bit_cast<std::uint32_t>(of_row)
+                         : *to[row] + static_cast<std::uint32_t>(static_cast<std::int32_t>(of_row));
     }
   }
+}
+void Wgmma::compute(const Product& product) const {
+  if (product.kind == WgmmaProduct::bf16)
+    compute<16>(product);
+  else
+    compute<32>(product);
 }
 
 void check_warpgroups(const std::vector<const Wgmma*>& warps) {

@@ -38,6 +38,8 @@ class Wgmma {
     WgmmaSums* sums;
   };
   void read(const Product& product) const;
+  template <int kDepth>
+  void compute(const Product& product) const;
   void compute(const Product& product) const;
   bool is_idle() const { return open_.empty() && committed_.empty(); }
 
