@@ -129,7 +129,7 @@ libero:
 	@echo
 	@echo "next:  $(LIBERO)/bin/vla-eval libero --vla build/cpu/bin/vla --bundle models/libero-object-tiny.gguf --task libero_object/4 --episodes 1 --film all"
 
-asan: packages $(STAMP)
+asan: packages
 	@test -f build/asan/build.ninja || cmake --preset asan $(CMAKE_ARGS)
 	cmake --build --preset asan
 
@@ -140,7 +140,7 @@ tsan: packages
 	ctest --preset tsan --no-tests=error
 
 # What tests need besides is downloaded while the first build compiles.
-test: packages $(STAMP)
+test: packages
 	@$(MAKE) --no-print-directory -j2 asan test-tools
 	@$(MAKE) --no-print-directory vulkan
 	$(VENV)/bin/python scripts/test.py

@@ -17,7 +17,9 @@ function(vla_fetch_ggml out)
   endif()
   if(NOT EXISTS ${archive})
     message(STATUS "Downloading ggml (75 MB, once)")
-    find_program(VLA_PYTHON NAMES python3 PATHS ${CMAKE_SOURCE_DIR}/.venv/bin NO_DEFAULT_PATH)
+    if(EXISTS ${CMAKE_SOURCE_DIR}/.venv/.complete)  # else make may be about to fill it
+      find_program(VLA_PYTHON NAMES python3 PATHS ${CMAKE_SOURCE_DIR}/.venv/bin NO_DEFAULT_PATH)
+    endif()
     find_program(VLA_PYTHON NAMES python3 REQUIRED)
     execute_process(
       COMMAND ${VLA_PYTHON} -m pip download --quiet --disable-pip-version-check --no-deps --no-binary llama-cpp-python
