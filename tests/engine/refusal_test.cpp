@@ -220,8 +220,9 @@ TEST_CASE(
 }
 
 TEST_CASE("every number of every architecture has a range, and one beyond it is refused by its key") {
-  int n_checked = 0;
-  for (const std::string& path : some_of(golden_bundles())) {
+  std::size_t n_checked = 0;
+  const std::vector<std::string> all = golden_bundles(), some = some_of(all);
+  for (const std::string& path : some) {
     EditableBundle bundle = EditableBundle::read(path);
     const Keys sound = bundle.keys;
     for (const auto& [key, value] : sound.all())
@@ -235,7 +236,7 @@ TEST_CASE("every number of every architecture has a range, and one beyond it is 
         ++n_checked;
       }
   }
-  CHECK(n_checked > 200);
+  CHECK(n_checked * all.size() > 500 * some.size());
 }
 
 TEST_CASE("statistics that the recipe does not read are an unused tensor") {
