@@ -17,7 +17,7 @@ function(vla_fetch_ggml out)
   endif()
   if(NOT EXISTS ${archive})
     message(STATUS "Downloading ggml (75 MB, once)")
-    if(EXISTS ${CMAKE_SOURCE_DIR}/.venv/.complete)  # else make may be about to fill it
+    if(EXISTS ${CMAKE_SOURCE_DIR}/.venv/.complete)  # before, it may lack pip
       find_program(VLA_PYTHON NAMES python3 PATHS ${CMAKE_SOURCE_DIR}/.venv/bin NO_DEFAULT_PATH)
     endif()
     find_program(VLA_PYTHON NAMES python3 REQUIRED)

@@ -38,7 +38,7 @@ struct Sums : WgmmaSums {
 struct Warp {
   Meeting* lanes[kWarp] = {};
   int n_here = 0;
-  Meeting::Kind kind = Meeting::kSync;  // of those that are here
+  Meeting::Kind kind = Meeting::kSync;  // what the lanes that are here came to
   Wgmma wgmma = {};
   std::list<Sums> sums = {};  // in flight
 };

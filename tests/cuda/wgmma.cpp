@@ -84,7 +84,7 @@ void Wgmma::read(const Product& product) const {
 template <int kDepth>
 void Wgmma::compute(const Product& product) const {
   constexpr bool kIsBf16 = kDepth == 16;
-  using Eight [[gnu::vector_size(32)]] = float;  // a number of each row
+  using Eight [[gnu::vector_size(32)]] = float;  // one number of each of eight rows
   const auto load = [&](const Operand& from, int row, float(&to)[kDepth]) {
     std::uint8_t bytes[kDepthBytes];
     for (int which = 0; which < 2; ++which)
