@@ -5,7 +5,6 @@
 #include <fmt/format.h>
 #include <unistd.h>
 
-#include <csignal>
 #include <filesystem>
 #include <optional>
 
@@ -13,6 +12,7 @@
 #include "cli/say.h"
 #ifdef VLA_SERVER
 #include "cli/calibration.h"
+#include "cli/signals.h"
 #endif
 
 namespace vla::cli {
@@ -199,17 +199,8 @@ class Trials {
       for (const char* ending : {"", ".codes", ".int8", ".int4", ".trial"})
         if (*bundle != 0 || *ending != 0) files_.push_back(to + bundle + ending);
     remove();
-    struct sigaction action = {};
-    action.sa_handler = [](int signal) {
-      remove();
-      std::signal(signal, SIG_DFL);
-      std::raise(signal);
-    };
-    for (const int signal : {SIGINT, SIGTERM, SIGHUP}) {
-      struct sigaction before = {};
-      sigaction(signal, nullptr, &before);
-      if (before.sa_handler != SIG_IGN) sigaction(signal, &action, nullptr);
-    }
+    signals_.emplace([](int signal) { remove(), EndSignals::end_by(signal); },
+                     std::initializer_list<int>{SIGTERM, SIGINT, SIGHUP});
   }
   ~Trials() { remove(); }
   Trials(const Trials&) = delete;
@@ -220,6 +211,7 @@ class Trials {
     for (const std::string& file : files_) ::unlink(file.c_str());
   }
   static inline std::vector<std::string> files_;  // constant once a signal may arrive
+  std::optional<EndSignals> signals_;
 };
 #endif
 

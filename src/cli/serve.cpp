@@ -8,7 +8,6 @@
 #include <algorithm>
 #include <cctype>
 #include <cerrno>
-#include <csignal>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -20,6 +19,7 @@
 #include "cli/kept_memory.h"
 #include "cli/observability.h"
 #include "cli/say.h"
+#include "cli/signals.h"
 #include "processor/constant_actions.h"
 #include "serve/control.h"
 #include "serve/names.h"
@@ -45,23 +45,10 @@ constexpr std::chrono::milliseconds kLoadPatience(500);  // at the end, for an o
 
 serve::Server* stopped_by_signals = nullptr;
 
-/// The first SIGTERM, SIGINT or SIGHUP lets the server finish; the next one, whichever it is, ends the process. SIGHUP
-/// stays ignored if the parent process ignores it, as nohup does.
-void stop_on_signals(serve::Server& server) {
-  stopped_by_signals = &server;
-  struct sigaction action = {};
-  action.sa_handler = [](int signal) {
-    if (stopped_by_signals->is_stopping()) {
-      std::signal(signal, SIG_DFL);
-      std::raise(signal);
-    }
-    stopped_by_signals->stop();
-  };
-  sigaction(SIGTERM, &action, nullptr);
-  sigaction(SIGINT, &action, nullptr);
-  struct sigaction hangup = {};
-  sigaction(SIGHUP, nullptr, &hangup);
-  if (hangup.sa_handler != SIG_IGN) sigaction(SIGHUP, &action, nullptr);
+/// The first signal lets the server finish; the next one, whichever it is, ends the process.
+void stop_or_end(int signal) {
+  if (stopped_by_signals->is_stopping()) EndSignals::end_by(signal);
+  stopped_by_signals->stop();
 }
 
 /// Quotes a value for a shell; plain words stay unquoted.
@@ -273,7 +260,8 @@ Status serve(ServeOptions& options, bool& ready) {
     warm_up_ms += policy.warm_up_ms;
   }
   VLA_CHECK(server->begin());
-  stop_on_signals(*server);
+  stopped_by_signals = server.get();
+  const EndSignals signals(stop_or_end, {SIGHUP});
   observability->ready(warm_up_ms);
   print_ready(*server, policies, options, *observability);
   policies.clear();  // only the server keeps them, so that an unloaded policy is freed

@@ -157,6 +157,23 @@ def test_two_signals_end_a_server_at_once_though_peers_are_in_the_midst_of_their
         server.process.communicate()
 
 
+def test_a_second_signal_while_a_server_frees_what_it_has_ends_it(vla, golden):
+    """At every moment of its end. A program with sanitizers looks for leaks then, which takes longest."""
+    codes = []
+    while 0 not in codes:
+        server = Server(vla, golden.bundle, *LOCAL)
+        try:
+            server.process.send_signal(signal.SIGINT)
+            time.sleep(0.002 * len(codes))
+            server.process.send_signal(signal.SIGTERM)
+            out, error = server.process.communicate(timeout=20)
+            assert (out, error) == ("", "")
+            codes.append(server.process.returncode)
+        finally:
+            server.process.kill()
+    assert set(codes) <= {0, -signal.SIGINT, -signal.SIGTERM}
+
+
 def test_a_recording_that_is_a_pipe_is_refused_at_once(vla, tmp_path):
     os.mkfifo(tmp_path / "requests.vlarec")
     answer = vla("replay", tmp_path)
