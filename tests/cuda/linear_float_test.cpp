@@ -130,6 +130,111 @@ TEST_CASE("strips multiply by a gate's matrix too") {
   CHECK(counts.bank_conflicts == 0);
 }
 
+namespace {
+
+/// Rotates the heads of a product's rows by a table [d_head, n_token]; rows are tokens of one batch after the other.
+std::vector<double> rotated(const std::vector<double>& y, int n_column, int d_head, int n_token,
+                            const std::vector<float>& table) {
+  std::vector<double> turned(y.size());
+  const int half = d_head / 2, n_row = static_cast<int>(y.size()) / n_column;
+  for (int row = 0; row < n_row; ++row)
+    for (int column = 0; column < n_column; ++column) {
+      const int i = column % d_head % half;
+      const auto at = static_cast<std::size_t>(row * n_column + column),
+                 place = static_cast<std::size_t>(row % n_token * d_head + i);
+      const bool is_first = column % d_head < half;
+      const double other = is_first ? -y[at + static_cast<std::size_t>(half)] : y[at - static_cast<std::size_t>(half)];
+      const auto cosine = static_cast<double>(table[place]), sine = static_cast<double>(table[place + d_head / 2]);
+      turned[at] = y[at] * cosine + other * sine;
+    }
+  return turned;
+}
+
+struct RotatedCase {
+  ProductCase product;
+  int d_head, n_token;
+};
+// Heads narrower and wider than a strip's half, and widths that are no powers of two; several batches; shares.
+constexpr RotatedCase kRotated[] = {
+    {{50, 720, 192, 1, Activation::none, false, false, false, false, true}, 64, 50},
+    {{48, 104, 72, 1, Activation::none, true}, 24, 16},
+    {{10, 64, 16, 1, Activation::none, true, false, false, false, true}, 8, 5},
+    {{65, 296, 256, 1}, 256, 65},
+    {{48, 296, 80, 3, Activation::none, true}, 40, 24},
+    {{9, 512, 1280, 2, Activation::none, false, false, false, false, true}, 256, 3},
+};
+
+}  // namespace
+
+TEST_CASE("products in strips, and kernels that add shares, rotate heads") {
+  counts = {};
+  for (const auto& [c, d_head, n_token] : kRotated) {
+    const Operands of(c, true);
+    Numbers numbers;
+    const std::vector<float> table = numbers.floats(d_head * n_token);
+    const std::vector<double> expected = rotated(of.expected(), c.n_column, d_head, n_token, table);
+    const std::int64_t stride = round_up(c.depth, 8);
+    for (Bf16Shape shape : {Bf16Shape::strip16, Bf16Shape::strip32, Bf16Shape::strip64, Bf16Shape::rows64}) {
+      if (shape == Bf16Shape::rows64 && c.n_split == 1) continue;
+      for (const std::size_t to_align : {0, 1}) {  // floats
+        if (to_align > 0 && shape != Bf16Shape::strip16) continue;
+        INFO("shape ", static_cast<int>(shape), ", ", c.n_row, " x ", c.depth, " x ", c.n_column, ", off ", to_align);
+        in_every_schedule([&] {
+          const std::vector<float> y = run_product(of, [&](const Epilogue& end) {
+            std::vector<float> placed(to_align, NAN);
+            placed.insert(placed.end(), table.begin(), table.end());
+            const Device<float> partial(static_cast<std::size_t>(c.n_split * c.n_row * c.n_column)), turns(placed);
+            const Device<std::uint16_t> x(bf16_rows(of.x, c.depth, stride)),
+                weight(bf16_rows(of.weight, c.depth, stride));
+            const LinearBf16Job job = {.x = x.get(),
+                                       .weight = weight.get(),
+                                       .x_stride = stride,
+                                       .weight_stride = stride,
+                                       .n_row = c.n_row,
+                                       .n_column = c.n_column,
+                                       .depth = c.depth,
+                                       .n_split = c.n_split,
+                                       .partial = partial.get(),
+                                       .end = end,
+                                       .rotation = {turns.get() + to_align, d_head, n_token}};
+            launch(linear_bf16(shape, job), job);
+            if (c.n_split > 1) launch(finish_bf16_partial(job), job);
+          });
+          CHECK(error(y, expected) < (c.is_bf16 ? 4e-3 : 2e-6 + 2 * bf16_sum_error(c.depth)));
+        });
+      }
+    }
+  }
+  CHECK(counts.bank_conflicts == 0);
+}
+
+TEST_CASE("a launch of several strips rotates some of its products, as launches of their own do") {
+  constexpr int kRows = 50, kDepth = 200, kColumns[] = {128, 36, 64}, kHead = 32;
+  Numbers numbers;
+  const std::int64_t stride = round_up(kDepth, 8);
+  const Device<std::uint16_t> x(bf16_rows(numbers.floats(kRows * kDepth), kDepth, stride));
+  const Device<float> table(numbers.floats(kHead * kRows)), bias(numbers.floats(128));
+  for (unsigned width : {16U, 32U, 64U}) {
+    std::vector<std::unique_ptr<Device<std::uint16_t>>> weights;
+    std::vector<std::unique_ptr<Device<float>>> together, alone;
+    Several<LinearBf16Job> jobs = {};
+    for (const int n : kColumns) {
+      const auto size = static_cast<std::size_t>(kRows * n);
+      weights.push_back(std::make_unique<Device<std::uint16_t>>(bf16_rows(numbers.floats(n * kDepth), kDepth, stride)));
+      together.push_back(std::make_unique<Device<float>>(size)), alone.push_back(std::make_unique<Device<float>>(size));
+      Epilogue end = {};
+      end.bias = bias.get(), end.y = alone.back()->get(), end.y_stride = n;
+      LinearBf16Job job = {x.get(), weights.back()->get(), stride, stride, kRows, n, kDepth, 1, nullptr, end};
+      if (n != 36) job.rotation = {table.get(), kHead, kRows};
+      launch(linear_strip(width, job), job);
+      job.end.y = together.back()->get();
+      jobs.job[jobs.n++] = job;
+    }
+    launch(linear_strips(width, jobs), jobs);
+    for (std::size_t i = 0; i < alone.size(); ++i) CHECK(together[i]->host() == alone[i]->host());
+  }
+}
+
 TEST_CASE("float32 products are within 2e-6 of doubles") {
   for (const ProductCase& c : kCases) {
     const Operands of(c, false);

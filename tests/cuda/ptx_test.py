@@ -35,7 +35,10 @@ MAIN_LOOPS = {
 STRIP_LOOPS = {
     name: ("HMMA.16816.F32.BF16", 48 if "_16" in name else 96 if "_32_gated" in name else 64)
     for width in (16, 32, 64, 128)
-    for name in (f"linear_strip_{width}", f"linear_strip_{width}_gated", *([f"linear_strips_{width}"] if width < 128 else []))
+    for name in (
+        *(f"linear_strip_{width}", f"linear_strip_{width}_gated"),
+        *([f"linear_strips_{width}", f"linear_strip_{width}_rotated", f"linear_strips_{width}_rotated"] if width < 128 else []),
+    )
 }
 # Of a tile for Hopper a warpgroup multiplies 128 bytes of the depth.
 HOPPER_LOOP = {"bf16": "HGMMA.64x{}x16.F32.BF16", "int8": "IGMMA.64x{}x32.S8.S8", "ternary": "IGMMA.64x{}x32.S8.S8"}

@@ -156,14 +156,10 @@ VLA_DEVICE void finish_four(const Epilogue& e, int row, int column, int n_column
   store_y(e, row, column, y, kTogether, n);
 }
 
-/// Stores y of two adjacent sums; the second may be after the last column.
-VLA_DEVICE void finish_pair(const Epilogue& e, const PairEnds& ends, float first, float second, std::int64_t row,
-                            int column) {
-  const auto activated = [&](float x) { return activate(e.activation, x); };
-  first = finish(e, ends.has_gate, first, ends.bias.x, ends.factor.x, ends.gate.x, ends.residual.x, activated);
-  second = finish(e, ends.has_gate, second, ends.bias.y, ends.factor.y, ends.gate.y, ends.residual.y, activated);
+/// Writes y of two adjacent columns; without has_second the second is after the last column.
+VLA_DEVICE void store_y(const Epilogue& e, std::int64_t row, int column, float first, float second, bool has_second) {
   const std::int64_t at = row * e.y_stride + column;
-  const bool together = ends.has_second && e.y_stride % 2 == 0;
+  const bool together = has_second && e.y_stride % 2 == 0;
   if (e.is_bf16) {
     const unsigned pair = dev::to_bf16(first, second);
     auto* y = static_cast<std::uint16_t*>(e.y) + at;
@@ -171,7 +167,7 @@ VLA_DEVICE void finish_pair(const Epilogue& e, const PairEnds& ends, float first
       *reinterpret_cast<unsigned*>(y) = pair;
     } else {
       y[0] = static_cast<std::uint16_t>(pair);
-      if (ends.has_second) y[1] = static_cast<std::uint16_t>(pair >> 16);
+      if (has_second) y[1] = static_cast<std::uint16_t>(pair >> 16);
     }
   } else {
     auto* y = static_cast<float*>(e.y) + at;
@@ -179,9 +175,18 @@ VLA_DEVICE void finish_pair(const Epilogue& e, const PairEnds& ends, float first
       *reinterpret_cast<float2*>(y) = float2{first, second};
     } else {
       y[0] = first;
-      if (ends.has_second) y[1] = second;
+      if (has_second) y[1] = second;
     }
   }
+}
+
+/// Stores y of two adjacent sums; the second may be after the last column.
+VLA_DEVICE void finish_pair(const Epilogue& e, const PairEnds& ends, float first, float second, std::int64_t row,
+                            int column) {
+  const auto activated = [&](float x) { return activate(e.activation, x); };
+  first = finish(e, ends.has_gate, first, ends.bias.x, ends.factor.x, ends.gate.x, ends.residual.x, activated);
+  second = finish(e, ends.has_gate, second, ends.bias.y, ends.factor.y, ends.gate.y, ends.residual.y, activated);
+  store_y(e, row, column, first, second, ends.has_second);
 }
 VLA_DEVICE void finish_pair(const Epilogue& e, float first, float second, std::int64_t row, int column, int n_column) {
   finish_pair(e, load_ends(e, row, column, n_column), first, second, row, column);

@@ -210,15 +210,38 @@ VLA_DEVICE void finish_four(const LinearBf16Job& job, int row, int column) {
   finish_four<kTogether>(job.end, row, column, job.n_column, sum, job.gate_weight || job.end.gate, gate);
 }
 
+/// Adds the shares of four adjacent pairs of a head, and stores both elements of each rotated.
+template <bool kTogether>
+VLA_DEVICE void finish_four_pairs(const LinearBf16Job& job, int row, int pair) {
+  const int column = job.rotation.first_column(pair), half = job.rotation.d_head / 2;
+  const float* const cosines = cosines_of(job.rotation, row, column);
+  const Four cosine = load_four(cosines, kTogether, 4), sine = load_four(cosines + half, kTogether, 4);
+  const auto add = [&](int from) {
+    Four sum = add_shares<kTogether>(job, row, from, 4);
+    if (job.end.bias == nullptr) return sum;
+    const Four bias = load_four(job.end.bias + from, kTogether, 4);
+#pragma unroll
+    for (int c = 0; c < 4; ++c) sum.of[c] = dev::add(sum.of[c], bias.of[c]);
+    return sum;
+  };
+  Four low = add(column), high = add(column + half);
+  rotate(low.of, high.of, cosine.of, sine.of);
+  store_y(job.end, row, column, low, kTogether, 4);
+  store_y(job.end, row, column + half, high, kTogether, 4);
+}
+
 /// Adds the partial sums of a split and computes y.
 VLA_DEVICE void finish_partial(const LinearBf16Job& job, int block) {
-  const int row = static_cast<int>(blockIdx.y), column = (block * 128 + thread_index()) * 4;
-  if (column >= job.n_column) return;
-  const auto others = reinterpret_cast<std::uint64_t>(job.gate_bias) | reinterpret_cast<std::uint64_t>(job.partial);
-  if (is_of_fours(job.end, job.n_column) && others % 16 == 0 && job.n_split <= kMostSplits)
-    finish_four<true>(job, row, column);
+  const int row = static_cast<int>(blockIdx.y), four = (block * 128 + thread_index()) * 4;
+  const bool rotates = job.rotation.table != nullptr;
+  if (four >= (rotates ? job.n_column / 2 : job.n_column)) return;
+  const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
+  const auto others = bits(job.gate_bias) | bits(job.partial) | bits(job.rotation.table);
+  const bool together = is_of_fours(job.end, job.n_column) && others % 16 == 0 && job.n_split <= kMostSplits;
+  if (rotates)
+    together ? finish_four_pairs<true>(job, row, four) : finish_four_pairs<false>(job, row, four);
   else
-    finish_four<false>(job, row, column);
+    together ? finish_four<true>(job, row, four) : finish_four<false>(job, row, four);
 }
 
 }  // namespace

@@ -9,6 +9,18 @@
 /// rows x stays float32, since rounding it would save nothing.
 namespace vla::cuda {
 
+/// Rotates the pairs (y_i, y_{i + d_head/2}) of each head, as HeadJob does; d_head is a multiple of 8.
+struct Rotation {
+  const float* table = nullptr;  // [d_head, n_token]: cosines, then sines of each token; null: nothing is rotated
+  int d_head = 0, n_token = 0;
+
+  /// The column of a pair's first element. Pairs are numbered through all heads.
+  VLA_HOST_DEVICE int first_column(int pair) const {
+    const int half = d_head / 2;
+    return pair / half * d_head + pair % half;
+  }
+};
+
 struct LinearBf16Job {
   // n_row rows with stride x_stride: float32 for few rows, else bf16 with a stride that is a multiple of 8
   const void* x;
@@ -25,6 +37,8 @@ struct LinearBf16Job {
   /// activation(x gate^T + gate_bias) * (x w^T + bias) and so on. Rows of `partial` then have the gate's sums first.
   const std::uint16_t* gate_weight = nullptr;
   const float* gate_bias = nullptr;
+  /// Only for strips of up to 64 columns, or where finish_bf16_partial adds the shares: y = rotated(x w^T + bias).
+  Rotation rotation = {};
 
   VLA_HOST_DEVICE int n_sum() const { return gate_weight ? 2 * n_column : n_column; }  // per row
 };
@@ -52,20 +66,30 @@ constexpr unsigned strip_width(Bf16Shape shape) {
   }
 }
 inline Launch linear_strip(unsigned width, const LinearBf16Job& job) {
-  constexpr const char* kNames[2][4] = {
+  constexpr const char* kNames[3][4] = {
       {"linear_strip_16", "linear_strip_32", "linear_strip_64", "linear_strip_128"},
-      {"linear_strip_16_gated", "linear_strip_32_gated", "linear_strip_64_gated", "linear_strip_128_gated"}};
+      {"linear_strip_16_gated", "linear_strip_32_gated", "linear_strip_64_gated", "linear_strip_128_gated"},
+      {"linear_strip_16_rotated", "linear_strip_32_rotated", "linear_strip_64_rotated"}};
+  const int kind = job.gate_weight != nullptr ? 1 : job.rotation.table != nullptr && job.n_split == 1 ? 2 : 0;
   const int which = width == 16 ? 0 : width == 32 ? 1 : width == 64 ? 2 : 3;
   const unsigned n_sum = width == 128 ? 2 : width == 64 ? 4 : 8;  // warps that have the same columns
-  return {kNames[job.gate_weight != nullptr][which],
+  return {kNames[kind][which],
           {blocks(job.n_sum(), width), blocks(job.n_row, 64), static_cast<unsigned>(job.n_split)},
           256,
           n_sum * 64 * (width + 8) * 4};
 }
-/// Several products in strips of the same width, rows and depth, without gates and splits.
+/// Several products in strips of the same width, rows and depth, without gates and splits. If any is rotated, all must
+/// have a multiple of four columns.
 inline Launch linear_strips(unsigned width, Several<LinearBf16Job>& jobs) {
+  constexpr const char* kNames[2][3] = {
+      {"linear_strips_16", "linear_strips_32", "linear_strips_64"},
+      {"linear_strips_16_rotated", "linear_strips_32_rotated", "linear_strips_64_rotated"}};
   Launch launch = linear_strip(width, jobs.job[0]);
-  launch.kernel = width == 16 ? "linear_strips_16" : width == 32 ? "linear_strips_32" : "linear_strips_64";
+  bool rotates = false;
+  for (int i = 0; i < jobs.n; ++i) rotates = rotates || jobs.job[i].rotation.table != nullptr;
+  launch.kernel = kNames[rotates][width == 16 ? 0 : width == 32 ? 1 : 2];
+  for (int i = 0; i < jobs.n; ++i)
+    if (jobs.job[i].rotation.table == nullptr) jobs.job[i].rotation.d_head = jobs.job[i].n_column;  // one head
   launch.grid.x = fill_ends(jobs, [&](const LinearBf16Job& one) { return blocks(one.n_column, width); });
   return launch;
 }
@@ -137,7 +161,8 @@ inline Launch hopper_linears_bf16(const HopperTile& tile, Several<LinearBf16Job>
 }
 
 inline Launch finish_bf16_partial(const LinearBf16Job& job) {
-  return {"linear_bf16_finish", {blocks(job.n_column, 512), static_cast<unsigned>(job.n_row)}, 128};
+  const int n_four = job.rotation.table != nullptr ? job.n_column / 8 : (job.n_column + 3) / 4;
+  return {"linear_bf16_finish", {blocks(n_four, 128), static_cast<unsigned>(job.n_row)}, 128};
 }
 inline Launch finish_bf16_partials(Several<LinearBf16Job>& jobs) {
   const unsigned n_block = fill_ends(jobs, [](const LinearBf16Job& one) { return finish_bf16_partial(one).grid.x; });

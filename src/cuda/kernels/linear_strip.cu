@@ -7,14 +7,18 @@ namespace {
 
 constexpr int kWarps = 8, kThreads = kWarps * kLanes, kStripRows = 64, kTilesM = kStripRows / 16;
 
-/// A block computes sums of up to 64 rows and kColumns columns, half of them the gate's if there is a gate. A warp has
-/// kTilesN * 8 of the columns; warps with the same columns take the steps of the depth in turn.
-template <int kTilesN_, int kWarpsN_, bool kGated_>
+/// The two halves of a block's columns: of one matrix without halves, of a gate and of the product that it multiplies,
+/// or the first and the second elements of the pairs that a rotation turns.
+enum class Halves { none, gated, rotated };
+
+/// A block computes sums of up to 64 rows and kColumns columns. A warp has kTilesN * 8 of the columns; warps with the
+/// same columns take the steps of the depth in turn.
+template <int kTilesN_, int kWarpsN_, Halves kHalves>
 struct Strip {
   static constexpr int kTilesN = kTilesN_, kWarpsN = kWarpsN_, kWarpsK = kWarps / kWarpsN;
-  static constexpr bool kGated = kGated_;
+  static constexpr bool kGated = kHalves == Halves::gated, kRotated = kHalves == Halves::rotated;
   static constexpr int kColumns = kTilesN * 8 * kWarpsN;
-  static constexpr int kColumnsY = kGated ? kColumns / 2 : kColumns;
+  static constexpr int kColumnsY = kHalves == Halves::none ? kColumns : kColumns / 2;  // of y, or pairs
   // Steps that a warp loads ahead: all of a depth of 768 where registers suffice.
   static constexpr int kAhead = kTilesN == 2 || (kGated && kWarpsN == 1) ? 3 : 2;
   static constexpr int kRowBytes = (kColumns + 8) * 4;  // a row of sums in shared memory, padded against bank conflicts
@@ -37,10 +41,11 @@ class Operands {
 #pragma unroll
     for (int n = 0; n < S::kTilesN; ++n) {
       const int column = of_warp + n * 8;
-      const bool is_gate = S::kGated && column < S::kColumnsY;
-      const int of = column0 + (S::kGated && !is_gate ? column - S::kColumnsY : column) + lane / 4;
-      weight_[n] = reinterpret_cast<const std::byte*>(is_gate ? job.gate_weight : job.weight) +
-                   nearest(of, job.n_column) * job.weight_stride * 2;
+      const bool is_second = column >= S::kColumnsY, is_gate = S::kGated && !is_second;
+      const int of = column0 + (is_second ? column - S::kColumnsY : column) + lane / 4;
+      weight_[n] =
+          reinterpret_cast<const std::byte*>(is_gate ? job.gate_weight : job.weight) +
+          row_of(job, nearest(of, S::kRotated ? job.n_column / 2 : job.n_column), is_second) * job.weight_stride * 2;
     }
   }
 
@@ -74,6 +79,10 @@ class Operands {
   }
 
  private:
+  /// The matrix's row of a column, or of an element of a pair.
+  static VLA_DEVICE int row_of(const LinearBf16Job& job, int of, bool is_second) {
+    return S::kRotated ? job.rotation.first_column(of) + (is_second ? job.rotation.d_head / 2 : 0) : of;
+  }
   static VLA_DEVICE int chunk_of(int step) { return step * (kBf16Depth / 8) + thread_index() % 4; }
 
   const std::byte *x_, *weight_[S::kTilesN];
@@ -81,35 +90,48 @@ class Operands {
   int n_chunk_;
 };
 
-/// Adds the sums of warps that share columns, in their order, and stores pairs of y.
+/// What a thread stores of a strip: pairs of adjacent columns, in some rows.
+template <class S>
+struct Stores {
+  static constexpr int kPairs = S::kColumnsY / 2, kEach = kStripRows * kPairs / kThreads;
+  int column = thread_index() % kPairs * 2;
+
+  VLA_DEVICE int row(int i) const {
+    const int number = thread_index() / kPairs;
+    // If a transaction reads two or four rows, this order puts them in different banks.
+    const int first = kPairs == 8 ? (number & ~3) + number % 2 * 2 + number / 2 % 2 : number;
+    return first + i * (kThreads / kPairs);
+  }
+};
+
+/// Adds the sums of the warps that share two columns, from `column` on, in the warps' order.
+template <class S>
+VLA_DEVICE float2 add_warps(int row, int column) {
+  float2 sum = {0, 0};
+#pragma unroll
+  for (int w = 0; w < S::kWarpsK; ++w) {
+    const auto pair = dev::read<float2>(dev::shared_memory() + (w * kStripRows + row) * S::kRowBytes + column * 4);
+    sum.x += pair.x, sum.y += pair.y;
+  }
+  return sum;
+}
+
+/// Adds the sums of warps that share columns, and stores pairs of y.
 template <class S>
 VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
-  constexpr int kPairs = S::kColumnsY / 2, kOf = kStripRows * S::kRowBytes, kEach = kStripRows * kPairs / kThreads;
-  constexpr int kApart = kThreads / kPairs;  // distance between two rows of a thread
-  const int number = thread_index() / kPairs, of_block = thread_index() % kPairs * 2, column = column0 + of_block;
-  // If a transaction reads two or four rows, this order puts them in different banks.
-  const int first_row = kPairs == 8 ? (number & ~3) + number % 2 * 2 + number / 2 % 2 : number;
+  const Stores<S> mine;
+  const int column = column0 + mine.column;
   const auto valid = [&](int row) { return row0 + row < job.n_row && column < job.n_column; };
-  const auto add = [&](int row, int at) {
-    float2 sum = {0, 0};
+  PairEnds ends[mine.kEach];
 #pragma unroll
-    for (int w = 0; w < S::kWarpsK; ++w) {
-      const auto pair = dev::read<float2>(dev::shared_memory() + w * kOf + row * S::kRowBytes + at * 4);
-      sum.x += pair.x, sum.y += pair.y;
-    }
-    return sum;
-  };
-  PairEnds ends[kEach];
-#pragma unroll
-  for (int i = 0; i < kEach; ++i)
-    if (job.n_split == 1 && valid(first_row + i * kApart))
-      ends[i] = load_ends(job.end, row0 + first_row + i * kApart, column, job.n_column);
+  for (int i = 0; i < mine.kEach; ++i)
+    if (job.n_split == 1 && valid(mine.row(i))) ends[i] = load_ends(job.end, row0 + mine.row(i), column, job.n_column);
   __syncthreads();  // sums of all warps are there
 #pragma unroll
-  for (int i = 0; i < kEach; ++i) {
-    const int row = first_row + i * kApart;
-    const float2 gate = S::kGated ? add(row, of_block) : float2{0, 0};
-    const float2 sum = add(row, S::kColumns - S::kColumnsY + of_block);
+  for (int i = 0; i < mine.kEach; ++i) {
+    const int row = mine.row(i);
+    const float2 gate = S::kGated ? add_warps<S>(row, mine.column) : float2{0, 0};
+    const float2 sum = add_warps<S>(row, S::kColumns - S::kColumnsY + mine.column);
     if (!valid(row)) continue;
     if (job.n_split > 1) {
       const bool has_second = column + 1 < job.n_column;
@@ -122,6 +144,38 @@ VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
       add_gate_bias(job, ends[i], column);
     }
     finish_pair(job.end, ends[i], sum.x, sum.y, row0 + row, column);
+  }
+}
+
+/// Adds the sums of warps that share columns, and stores the elements of two adjacent pairs, rotated if there is a
+/// table.
+template <class S>
+VLA_DEVICE void add_and_rotate(const LinearBf16Job& job, int row0, int pair0) {
+  const Stores<S> mine;
+  const int pair = pair0 + mine.column, half = job.rotation.d_head / 2, column = job.rotation.first_column(pair);
+  const float* const bias = job.end.bias;
+  const bool rotates = job.rotation.table != nullptr, is_valid = pair < job.n_column / 2;
+  float2 low_bias = {kAddsNothing, kAddsNothing}, high_bias = low_bias;
+  if (is_valid && bias != nullptr)
+    low_bias = {bias[column], bias[column + 1]}, high_bias = {bias[column + half], bias[column + half + 1]};
+  float turn[mine.kEach][4] = {};  // two cosines, two sines
+#pragma unroll
+  for (int i = 0; i < mine.kEach; ++i) {
+    if (!rotates || !is_valid || row0 + mine.row(i) >= job.n_row) continue;
+    const float* const cosine = cosines_of(job.rotation, row0 + mine.row(i), column);
+    turn[i][0] = cosine[0], turn[i][1] = cosine[1], turn[i][2] = cosine[half], turn[i][3] = cosine[half + 1];
+  }
+  __syncthreads();  // sums of all warps are there
+#pragma unroll
+  for (int i = 0; i < mine.kEach; ++i) {
+    const int row = mine.row(i);
+    const float2 first = add_warps<S>(row, mine.column), second = add_warps<S>(row, S::kColumnsY + mine.column);
+    if (!is_valid || row0 + row >= job.n_row) continue;
+    float low[2] = {dev::add(first.x, low_bias.x), dev::add(first.y, low_bias.y)};
+    float high[2] = {dev::add(second.x, high_bias.x), dev::add(second.y, high_bias.y)};
+    if (rotates) rotate(low, high, turn[i], turn[i] + 2);
+    store_y(job.end, row0 + row, column, low[0], low[1], true);
+    store_y(job.end, row0 + row, column + half, high[0], high[1], true);
   }
 }
 
@@ -161,7 +215,10 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job, int block) {
       for (int high = 0; high < 2; ++high)
         dev::write(room + (m * 16 + high * 8 + lane / 4) * S::kRowBytes + (of_warp + n * 8 + lane % 4 * 2) * 4,
                    float2{sum[m][n][2 * high], sum[m][n][2 * high + 1]});
-  add_and_store<S>(job, row0, column0);
+  if constexpr (S::kRotated)
+    add_and_rotate<S>(job, row0, column0);
+  else
+    add_and_store<S>(job, row0, column0);
 }
 
 }  // namespace
@@ -175,17 +232,23 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job, int block) {
     run_one(job, blockIdx.x,                                                                              \
             [](const LinearBf16Job& one, int block) { multiply_strip<Strip<__VA_ARGS__>>(one, block); }); \
   }
-VLA_STRIP(16, 2, 1, false)
-VLA_STRIP(32, 4, 1, false)
-VLA_STRIP(64, 4, 2, false)
-VLA_STRIP(128, 4, 4, false)
-VLA_STRIP(16_gated, 2, 1, true)
-VLA_STRIP(32_gated, 4, 1, true)
-VLA_STRIP(64_gated, 4, 2, true)
-VLA_STRIP(128_gated, 4, 4, true)
-VLA_STRIPS(16, 2, 1, false)
-VLA_STRIPS(32, 4, 1, false)
-VLA_STRIPS(64, 4, 2, false)
+VLA_STRIP(16, 2, 1, Halves::none)
+VLA_STRIP(32, 4, 1, Halves::none)
+VLA_STRIP(64, 4, 2, Halves::none)
+VLA_STRIP(128, 4, 4, Halves::none)
+VLA_STRIP(16_gated, 2, 1, Halves::gated)
+VLA_STRIP(16_rotated, 2, 1, Halves::rotated)
+VLA_STRIP(32_gated, 4, 1, Halves::gated)
+VLA_STRIP(32_rotated, 4, 1, Halves::rotated)
+VLA_STRIP(64_gated, 4, 2, Halves::gated)
+VLA_STRIP(64_rotated, 4, 2, Halves::rotated)
+VLA_STRIP(128_gated, 4, 4, Halves::gated)
+VLA_STRIPS(16, 2, 1, Halves::none)
+VLA_STRIPS(16_rotated, 2, 1, Halves::rotated)
+VLA_STRIPS(32, 4, 1, Halves::none)
+VLA_STRIPS(32_rotated, 4, 1, Halves::rotated)
+VLA_STRIPS(64, 4, 2, Halves::none)
+VLA_STRIPS(64_rotated, 4, 2, Halves::rotated)
 #undef VLA_STRIP
 #undef VLA_STRIPS
 

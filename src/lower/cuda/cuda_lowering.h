@@ -40,12 +40,19 @@ struct AttentionPlan {
   double us = 0;                                // estimated time on Hopper, on tensor cores
 };
 
+/// The rotation of heads by the product that makes them (cuda::Rotation).
+struct HeadRotation {
+  ValueId table = kNone;  // kNone: nothing is rotated
+  std::int64_t d_head = 0, n_token = 0;
+};
+
 struct CudaOp : Step {
   AnyOp<HeadOp> op;
-  ProductCut cut = {};      // LinearOp only
-  AttentionPlan plan = {};  // AttentionOp only
-  ValueId gate = kNone;     // the gate product's result, if no kernel computes gate and up together
-  ValueId partial = kNone;  // partial results of the shares of the depth or of the keys; none of a cluster
+  ProductCut cut = {};         // LinearOp only
+  AttentionPlan plan = {};     // AttentionOp only
+  ValueId gate = kNone;        // the gate product's result, if no kernel computes gate and up together
+  ValueId partial = kNone;     // partial results of the shares of the depth or of the keys; none of a cluster
+  HeadRotation rotation = {};  // LinearOp only
   std::shared_ptr<const CudaOp> finishes = nullptr;  // norms only: the product whose depth shares are added first
 };
 /// Whether another operation adds the depth shares of this product.
@@ -76,8 +83,8 @@ struct CudaLowering : Lowering {
 
 /// Makes operands readable for the kernels: copies operands with a wrong layout, converts the inputs of bf16 and int8
 /// products, and norms and rotates heads before attention. Attention reads keys and values in place, or as bf16. A
-/// value whose only reader is such a conversion is stored converted. Also splits the depth of products, and lets norms
-/// add the shares.
+/// value whose only reader is such a conversion is stored converted, and some products rotate the heads that they make.
+/// Also splits the depth of products, and lets norms add the shares.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 
 /// The strip width, 16 to 64, for several products in one launch without split depth.

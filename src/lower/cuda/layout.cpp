@@ -35,6 +35,9 @@ class CudaLayouts final : Layouts<CudaLowering> {
     std::erase_if(l.ops, [](const CudaOp& op) { return op.writes.empty(); });
     for (std::size_t i = 0; i < l.ops.size(); ++i) cut_together(i);
     for (CudaOp& op : l.ops)
+      if (auto* head = std::get_if<HeadOp>(&op.op)) rotate_at_once(op, head->rows);
+    std::erase_if(l.ops, [](const CudaOp& op) { return op.writes.empty(); });
+    for (CudaOp& op : l.ops)
       if (const auto* product = std::get_if<LinearOp>(&op.op); product != nullptr && !op.cut.in_cluster)
         split(op, op.cut.n_split, n_sum(op, *product));
     for (CudaOp& op : l.ops)
@@ -148,22 +151,48 @@ class CudaLayouts final : Layouts<CudaLowering> {
     maker->writes[0] = round.writes[0];
     round.writes.clear();
   }
+  /// The operation that makes heads, if they are all of its result and nothing else reads it; else null.
+  CudaOp* maker_of_heads(const HeadRows& rows) {
+    const Value &x = l.value(rows.x), &base = l.base(rows.x);
+    const bool is_whole = is_contiguous(x) && x.offset == 0 && count(x.shape) == count(base.shape) &&
+                          base.placement == Value::Placement::arena && !is_tapped(x.base);
+    CudaOp* const maker = is_whole && n_reader_[x.base] == 1 ? maker_of(x.base) : nullptr;
+    return maker != nullptr && std::holds_alternative<LinearOp>(maker->op) ? maker : nullptr;
+  }
+  /// Lets a product store the heads that it makes as `head` would, and removes the operation `head`.
+  void make_at_once(CudaOp& maker, CudaOp& head) {
+    const ValueId to = head.writes[0];
+    maker.writes[0] = add_rows(Shape(l.value(maker.writes[0]).shape), l.value(to).type);
+    l.value(to).base = maker.writes[0];
+    head.writes.clear();
+  }
   /// Stores heads rounded by the product that makes them if they are neither normed nor rotated and have no other
   /// reader.
   void round_heads_at_once(CudaOp& head, const HeadRows& rows) {
-    const Value x = l.value(rows.x);
-    const ValueId to = head.writes[0];
-    const bool is_whole = is_contiguous(x) && x.offset == 0 && count(x.shape) == count(l.base(rows.x).shape) &&
-                          l.base(rows.x).placement == Value::Placement::arena && !is_tapped(x.base);
-    if (rows.norm != nullptr || rows.rope != nullptr || l.value(to).type != DType::bf16 || !is_whole ||
-        n_reader_[x.base] != 1)
-      return;
-    CudaOp* const maker = maker_of(x.base);
-    if (maker == nullptr || !std::holds_alternative<LinearOp>(maker->op)) return;
-    const Shape rows_of_product = l.value(x.base).shape;
-    maker->writes[0] = add_rows(rows_of_product, DType::bf16);
-    l.value(to).base = maker->writes[0];
-    head.writes.clear();
+    if (rows.norm != nullptr || rows.rope != nullptr || l.value(head.writes[0]).type != DType::bf16) return;
+    if (CudaOp* const maker = maker_of_heads(rows)) make_at_once(*maker, head);
+  }
+  /// Rotates heads in the product that makes them, or in the kernel that adds its shares. This shortens a layer's chain
+  /// by one kernel.
+  void rotate_at_once(CudaOp& head, const HeadRows& rows) {
+    const Shape x = l.value(rows.x).shape;
+    if (rows.norm != nullptr || rows.rope == nullptr || x[0] % 8 != 0) return;
+    CudaOp* const maker = maker_of_heads(rows);
+    if (maker == nullptr || !rotates(*maker)) return;
+    const CudaOp* const of_table = maker_of(l.value(rows.table).base);
+    if (of_table != nullptr && of_table->order >= maker->order) return;
+    make_at_once(*maker, head);
+    maker->rotation = {rows.table, x[0], x[2]};
+    maker->reads.push_back(rows.table);
+  }
+  /// Whether kernels of a product can rotate its result (cuda::LinearBf16Job::rotation).
+  bool rotates(const CudaOp& op) const {
+    const auto& product = std::get<LinearOp>(op.op);
+    const unsigned width = op.cut.tile ? 0 : strip_width(op.cut.shape);
+    const bool has_kernel = op.cut.n_split > 1 ? !op.cut.in_cluster : width > 0 && width <= 64;
+    return has_kernel && product.linears.size() == 1 && l.matrix(*product.linears[0]).kind == MatrixKind::bf16 &&
+           product.activation == Activation::none && !product.ends_in_relu && product.factor == kNone &&
+           product.residual == kNone;
   }
   /// Lets a norm add the depth shares of the product that it reads, if no other operation reads the product's result
   /// before. This shortens a layer's chain by one kernel.

@@ -61,11 +61,18 @@ bool are_alike(const Calls& a, const Calls& b) {
          (one.partial == nullptr) == (other.partial == nullptr);
 }
 
+/// Whether two products in strips may be one launch: if it rotates, all must have a multiple of four columns.
+bool may_share_strips(const Calls& a, const Calls& b) {
+  const auto one = job_of<cuda::LinearBf16Job>(a[0]), other = job_of<cuda::LinearBf16Job>(b[0]);
+  const bool rotates = one.rotation.table != nullptr || other.rotation.table != nullptr;
+  return are_alike(a, b) && (!rotates || (one.n_column | other.n_column) % 4 == 0);
+}
+
 }  // namespace
 
 void merge_calls(std::vector<Calls>& phase, int n_sm) {
   using Products = cuda::Several<cuda::LinearBf16Job>;
-  merge<cuda::LinearBf16Job>(phase, is_strip, are_alike, [&](const Calls&, Products& jobs) {
+  merge<cuda::LinearBf16Job>(phase, is_strip, may_share_strips, [&](const Calls&, Products& jobs) {
     std::int64_t n_column = 0;
     for (int i = 0; i < jobs.n; ++i) n_column += jobs.job[i].n_column;
     const unsigned width = common_width(jobs.job[0].n_row, n_column, jobs.job[0].depth, n_sm);

@@ -34,18 +34,20 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
       return;
     }
     case MatrixKind::bf16: {
-      const cuda::LinearBf16Job job = {.x = l.at<void>(of),
-                                       .weight = l.param<std::uint16_t>(&weight),
-                                       .x_stride = row_stride(x),
-                                       .weight_stride = bf16_stride(depth),
-                                       .n_row = rows,
-                                       .n_column = columns,
-                                       .depth = depth,
-                                       .n_split = n_split,
-                                       .partial = l.at(op.partial),
-                                       .end = end,
-                                       .gate_weight = gate ? l.param<std::uint16_t>(gate->weight) : nullptr,
-                                       .gate_bias = gate ? l.param(gate->bias) : nullptr};
+      const cuda::LinearBf16Job job = {
+          .x = l.at<void>(of),
+          .weight = l.param<std::uint16_t>(&weight),
+          .x_stride = row_stride(x),
+          .weight_stride = bf16_stride(depth),
+          .n_row = rows,
+          .n_column = columns,
+          .depth = depth,
+          .n_split = n_split,
+          .partial = l.at(op.partial),
+          .end = end,
+          .gate_weight = gate ? l.param<std::uint16_t>(gate->weight) : nullptr,
+          .gate_bias = gate ? l.param(gate->bias) : nullptr,
+          .rotation = {l.at(op.rotation.table), narrow(op.rotation.d_head), narrow(op.rotation.n_token)}};
       calls.push_back(
           call(tile ? cuda::hopper_linear_bf16(cuda::kHopperTiles[*tile], job) : cuda::linear_bf16(shape, job), job));
       if (op.partial != kNone && !leaves_shares(op)) calls.push_back(call(cuda::finish_bf16_partial(job), job));
