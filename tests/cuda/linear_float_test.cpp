@@ -235,6 +235,37 @@ TEST_CASE("a launch of several strips rotates some of its products, as launches 
   }
 }
 
+TEST_CASE("one launch adds the shares of several products, and rotates some, as launches of their own do") {
+  constexpr int kRows = 20, kSplits = 3;
+  struct Product {
+    int n_column, d_head;  // d_head 0: not rotated
+  };
+  constexpr Product kProducts[] = {{1100, 0}, {1280, 80}, {33, 0}};
+  Numbers numbers;
+  const Device<float> bias(numbers.floats(1280)), table(numbers.floats(80 * kRows));
+  std::vector<std::unique_ptr<Device<float>>> shares, together, alone;
+  Several<LinearBf16Job> jobs = {};
+  for (const auto& [n_column, d_head] : kProducts) {
+    const auto size = static_cast<std::size_t>(kRows * n_column);
+    shares.push_back(std::make_unique<Device<float>>(numbers.floats(kSplits * kRows * n_column)));
+    together.push_back(std::make_unique<Device<float>>(size)), alone.push_back(std::make_unique<Device<float>>(size));
+    LinearBf16Job& job = jobs.job[jobs.n++];
+    job = {.n_row = kRows, .n_column = n_column, .n_split = kSplits, .partial = shares.back()->get()};
+    job.end.bias = bias.get(), job.end.y = alone.back()->get(), job.end.y_stride = n_column;
+    if (d_head > 0) job.rotation = {table.get(), d_head, kRows};
+    launch(finish_bf16_partial(job), job);
+    job.end.y = together.back()->get();
+  }
+  in_every_schedule([&] {
+    const Launch how = finish_bf16_partials(jobs);
+    launch(how, jobs);
+    for (std::size_t i = 0; i < alone.size(); ++i) {
+      CHECK(together[i]->host() == alone[i]->host());
+      CHECK(!std::isnan(together[i]->host().back()));
+    }
+  });
+}
+
 TEST_CASE("float32 products are within 2e-6 of doubles") {
   for (const ProductCase& c : kCases) {
     const Operands of(c, false);

@@ -3,6 +3,7 @@
 """Our own kernels for CUDA at the program's doors, on a driver that counts, refuses and fails (tests/cuda/library/libcuda.cpp)."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -66,6 +67,14 @@ def test_heads_that_nothing_turns_are_rounded_as_their_product_is_stored(vla):
     assert all(made[one].startswith("bf16[") for one in "qkv"), lines
     assert "attention_bf16" in next(line for line in lines if "attn_heads" in line)
     assert "heads  f32" not in graph
+
+
+@pytest.mark.parametrize("case", ["smolvla/absent_view", "pi0/absent_view"])
+def test_products_of_a_step_rotate_their_heads(vla, case):
+    graph = vla("inspect", Golden(case).bundle, *DEVICE, "--kernels", "bf16", "--graph", "step").out
+    products = [line for line in graph.splitlines() if re.search(r"\.attn_[qk], rope ", line)]
+    assert products and all(" -> bf16[" in line for line in products), graph
+    assert "rope heads" not in graph
 
 
 def test_kernels_that_a_build_lacks_are_refused_by_the_library_that_has_them(vla, golden):
