@@ -48,9 +48,14 @@ class CudaLayouts final : Layouts<CudaLowering> {
   ValueId add_rows(const Shape& shape, DType type = DType::f32) { return add_value(shape, type, shape[0]); }
 
   template <class Op>
+  CudaOp& add_op(Step step, Op op) {
+    l.ops.push_back({std::move(step), std::move(op)});
+    return l.ops.back();
+  }
+  template <class Op>
   void choose(Step& step, Op& op) {
     meet(step, op.operands());
-    l.ops.push_back({std::move(step), std::move(op)});
+    add_op(std::move(step), std::move(op));
   }
   /// Makes attention read keys and values in place instead of PackOp's result.
   void choose(Step& step, PackOp& op) {
@@ -65,7 +70,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     meet(step, rows.operands());
     if (rows.norm == nullptr && rows.rope == nullptr && !rounds) return;
     const ValueId to = add_rows(l.value(rows.x).shape, rounds ? DType::bf16 : DType::f32);
-    l.ops.push_back({{.reads = step.reads, .writes = {to}, .order = step.order}, HeadOp{rows}});
+    add_op({.reads = step.reads, .writes = {to}, .order = step.order}, HeadOp{rows});
     rows.x = to, rows.norm = rows.rope = nullptr;
   }
   /// bf16 kernels read heads in units of 16 bytes.
@@ -85,7 +90,8 @@ class CudaLayouts final : Layouts<CudaLowering> {
       round(step, op, DType::f32, depth, "round");
     meet(step, op.operands());
     const bool has_gate = op.gated && !is_one;
-    CudaOp& made = l.ops.emplace_back(CudaOp{std::move(step), std::move(op), cut});
+    CudaOp& made = add_op(std::move(step), std::move(op));
+    made.cut = cut;
     if (has_gate) made.writes.push_back(made.gate = add_rows(y));
   }
   /// The number of sums in one share of the depth.
@@ -239,7 +245,8 @@ class CudaLayouts final : Layouts<CudaLowering> {
     meet(step, op.operands());
     const Shape q = l.value(op.q.x).shape;
     const AttentionPlan plan = plan_attention(l, op);
-    CudaOp& made = l.ops.emplace_back(CudaOp{std::move(step), std::move(op), {}, plan});
+    CudaOp& made = add_op(std::move(step), std::move(op));
+    made.plan = plan;
     split(made, plan.n_split, (q[0] + 2) * q[1] * q[2] * q[3]);
   }
 
