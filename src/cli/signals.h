@@ -9,8 +9,8 @@
 
 namespace vla::cli {
 
-/// Handles SIGTERM, SIGINT and SIGHUP for as long as it lives. Threads of start_thread() block signals, so once it is
-/// gone no handler runs that uses what the program frees next.
+/// Handles SIGTERM, SIGINT and SIGHUP as long as it exists. Destroy it before what the handler uses: the main thread
+/// runs all handlers, since other threads block signals (start_thread), so none can be running then.
 class EndSignals {
  public:
   /// `stays_ignored`: those that are left alone if the parent process ignores them, as nohup ignores SIGHUP.

@@ -7,8 +7,8 @@ namespace {
 
 constexpr int kWarps = 8, kThreads = kWarps * kLanes, kStripRows = 64, kTilesM = kStripRows / 16;
 
-/// The two halves of a block's columns: of one matrix without halves, of a gate and of the product that it multiplies,
-/// or the first and the second elements of the pairs that a rotation turns.
+/// The two halves of a block's columns. gated: the gate's columns, then those of the other matrix. rotated: the first
+/// elements of the pairs that are rotated, then the second ones. none: there are no halves.
 enum class Halves { none, gated, rotated };
 
 /// A block computes sums of up to 64 rows and kColumns columns. A warp has kTilesN * 8 of the columns; warps with the
@@ -79,7 +79,7 @@ class Operands {
   }
 
  private:
-  /// The matrix's row of a column, or of an element of a pair.
+  /// The matrix's row for a column, or for the first or second element of a pair.
   static VLA_DEVICE int row_of(const LinearBf16Job& job, int of, bool is_second) {
     return S::kRotated ? job.rotation.first_column(of) + (is_second ? job.rotation.d_head / 2 : 0) : of;
   }
@@ -90,7 +90,7 @@ class Operands {
   int n_chunk_;
 };
 
-/// What a thread stores of a strip: pairs of adjacent columns, in some rows.
+/// The part of a strip that a thread stores: two adjacent columns of some rows.
 template <class S>
 struct Stores {
   static constexpr int kPairs = S::kColumnsY / 2, kEach = kStripRows * kPairs / kThreads;
@@ -147,8 +147,7 @@ VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
   }
 }
 
-/// Adds the sums of warps that share columns, and stores the elements of two adjacent pairs, rotated if there is a
-/// table.
+/// The same for two adjacent pairs, which are rotated if there is a table.
 template <class S>
 VLA_DEVICE void add_and_rotate(const LinearBf16Job& job, int row0, int pair0) {
   const Stores<S> mine;
