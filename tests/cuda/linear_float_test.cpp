@@ -68,22 +68,33 @@ TEST_CASE(
   CHECK(counts.bank_conflicts == 0);
 }
 
-TEST_CASE("several products in one launch of strips are those of launches of their own") {
-  constexpr int kRows = 50, kDepth = 200, kColumns[] = {70, 33, 128};
+namespace {
+
+struct StripProduct {
+  int n_column;
+  bool rotates;
+};
+constexpr int kHead = 32;  // of products that rotate
+
+/// Checks that one launch of strips stores what a launch for each product does.
+void check_several_strips(std::initializer_list<StripProduct> products) {
+  constexpr int kRows = 50, kDepth = 200;
   Numbers numbers;
   const std::int64_t stride = round_up(kDepth, 8);
   const Device<std::uint16_t> x(bf16_rows(numbers.floats(kRows * kDepth), kDepth, stride));
+  const Device<float> table(numbers.floats(kHead * kRows)), bias(numbers.floats(128));
   for (unsigned width : {16U, 32U, 64U}) {
     std::vector<std::unique_ptr<Device<std::uint16_t>>> weights;
     std::vector<std::unique_ptr<Device<float>>> together, alone;
     Several<LinearBf16Job> jobs = {};
-    for (const int n : kColumns) {
+    for (const auto& [n, rotates] : products) {
       const auto size = static_cast<std::size_t>(kRows * n);
       weights.push_back(std::make_unique<Device<std::uint16_t>>(bf16_rows(numbers.floats(n * kDepth), kDepth, stride)));
       together.push_back(std::make_unique<Device<float>>(size)), alone.push_back(std::make_unique<Device<float>>(size));
       Epilogue end = {};
-      end.y = alone.back()->get(), end.y_stride = n;
-      LinearBf16Job job = {x.get(), weights.back()->get(), stride, stride, kRows, n, kDepth, 1, nullptr, end, {}, {}};
+      end.bias = bias.get(), end.y = alone.back()->get(), end.y_stride = n;
+      LinearBf16Job job = {x.get(), weights.back()->get(), stride, stride, kRows, n, kDepth, 1, nullptr, end};
+      if (rotates) job.rotation = {table.get(), kHead, kRows};
       launch(linear_strip(width, job), job);
       job.end.y = together.back()->get();
       jobs.job[jobs.n++] = job;
@@ -91,6 +102,12 @@ TEST_CASE("several products in one launch of strips are those of launches of the
     launch(linear_strips(width, jobs), jobs);
     for (std::size_t i = 0; i < alone.size(); ++i) CHECK(together[i]->host() == alone[i]->host());
   }
+}
+
+}  // namespace
+
+TEST_CASE("several products in one launch of strips are those of launches of their own") {
+  check_several_strips({{70, false}, {33, false}, {128, false}});
 }
 
 TEST_CASE("strips multiply by a gate's matrix too") {
@@ -209,30 +226,7 @@ TEST_CASE("products in strips, and kernels that add shares, rotate heads") {
 }
 
 TEST_CASE("a launch of several strips rotates some of its products, as launches of their own do") {
-  constexpr int kRows = 50, kDepth = 200, kColumns[] = {128, 36, 64}, kHead = 32;
-  Numbers numbers;
-  const std::int64_t stride = round_up(kDepth, 8);
-  const Device<std::uint16_t> x(bf16_rows(numbers.floats(kRows * kDepth), kDepth, stride));
-  const Device<float> table(numbers.floats(kHead * kRows)), bias(numbers.floats(128));
-  for (unsigned width : {16U, 32U, 64U}) {
-    std::vector<std::unique_ptr<Device<std::uint16_t>>> weights;
-    std::vector<std::unique_ptr<Device<float>>> together, alone;
-    Several<LinearBf16Job> jobs = {};
-    for (const int n : kColumns) {
-      const auto size = static_cast<std::size_t>(kRows * n);
-      weights.push_back(std::make_unique<Device<std::uint16_t>>(bf16_rows(numbers.floats(n * kDepth), kDepth, stride)));
-      together.push_back(std::make_unique<Device<float>>(size)), alone.push_back(std::make_unique<Device<float>>(size));
-      Epilogue end = {};
-      end.bias = bias.get(), end.y = alone.back()->get(), end.y_stride = n;
-      LinearBf16Job job = {x.get(), weights.back()->get(), stride, stride, kRows, n, kDepth, 1, nullptr, end};
-      if (n != 36) job.rotation = {table.get(), kHead, kRows};
-      launch(linear_strip(width, job), job);
-      job.end.y = together.back()->get();
-      jobs.job[jobs.n++] = job;
-    }
-    launch(linear_strips(width, jobs), jobs);
-    for (std::size_t i = 0; i < alone.size(); ++i) CHECK(together[i]->host() == alone[i]->host());
-  }
+  check_several_strips({{128, true}, {36, false}, {64, true}});
 }
 
 TEST_CASE("one launch adds the shares of several products, and rotates some, as launches of their own do") {
