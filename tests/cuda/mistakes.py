@@ -336,7 +336,7 @@ MISTAKES = {
     "a warp norms a row behind the last": ("rows.cu", "rows", "if (row >= job.n_row) return;  // the whole warp", ""),
     "a wide row is kept all the same": ("rows.cu", "rows", "const bool is_kept = n <= kMaxKept;", "const bool is_kept = true;"),
     "a wide row without what was added": ("rows.cu", "rows", ": load(i); };", ": job.x[row * job.x_stride + i]; };"),
-    "heads turn the other way": ("rows.cu", "rows", "low[k] * cosine[k] - high[k] * sine[k]", "low[k] * cosine[k] + high[k] * sine[k]"),
+    "heads turn the other way": ("finish.h", "rows", "first * cosine[i] - second * sine[i]", "first * cosine[i] + second * sine[i]"),
     "the table's row of another token": (
         "rows.cu",
         "rows",

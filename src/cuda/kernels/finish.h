@@ -192,4 +192,14 @@ VLA_DEVICE void finish_pair(const Epilogue& e, float first, float second, std::i
   finish_pair(e, load_ends(e, row, column, n_column), first, second, row, column);
 }
 
+/// Rotates pairs of elements of a head, whose first and second elements are low and high.
+template <int kCount>
+VLA_DEVICE void rotate(float (&low)[kCount], float (&high)[kCount], const float* cosine, const float* sine) {
+#pragma unroll
+  for (int i = 0; i < kCount; ++i) {
+    const float first = low[i], second = high[i];
+    low[i] = first * cosine[i] - second * sine[i], high[i] = second * cosine[i] + first * sine[i];
+  }
+}
+
 }  // namespace vla::cuda

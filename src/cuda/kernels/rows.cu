@@ -305,12 +305,13 @@ VLA_DEVICE void turn_heads(const HeadJob& job, int block) {
       low[k] = normed(x[i], i), high[k] = normed(x[i + half], i + half);
       cosine[k] = table ? table[i] : 1, sine[k] = table ? table[half + i] : 0;
     }
+    rotate(low, high, cosine, sine);
 #pragma unroll
     for (int k = 0; k < kAtOnce; ++k) {
       const int i = first + kLanes * k;
       if (i >= half) break;
-      store(job.y, job.is_bf16, to + i, low[k] * cosine[k] - high[k] * sine[k]);
-      store(job.y, job.is_bf16, to + i + half, high[k] * cosine[k] + low[k] * sine[k]);
+      store(job.y, job.is_bf16, to + i, low[k]);
+      store(job.y, job.is_bf16, to + i + half, high[k]);
     }
   }
 }

@@ -31,15 +31,6 @@ VLA_DEVICE void add_gate_bias(const LinearBf16Job& job, PairEnds& ends, int colu
   if (ends.has_second) ends.gate.y = dev::add(ends.gate.y, job.gate_bias[column + 1]);
 }
 
-/// Rotates adjacent pairs, whose first and second elements are low and high.
-template <int kCount>
-VLA_DEVICE void rotate(float (&low)[kCount], float (&high)[kCount], const float* cosine, const float* sine) {
-#pragma unroll
-  for (int i = 0; i < kCount; ++i) {
-    const float first = low[i], second = high[i];
-    low[i] = first * cosine[i] - second * sine[i], high[i] = second * cosine[i] + first * sine[i];
-  }
-}
 /// The cosines of a row's token from the pair at `column` on; the sines follow after d_head / 2 values.
 VLA_DEVICE const float* cosines_of(const Rotation& rotation, int row, int column) {
   return rotation.table + row % rotation.n_token * rotation.d_head + column % rotation.d_head;
