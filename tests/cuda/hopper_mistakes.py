@@ -277,4 +277,34 @@ HOPPER_MISTAKES = {
         "job.scale[column + c]",
         "job.scale[column]",
     ),
+    "factors of a norm lie where sums do": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "factors = shared + T::kRows * (T::kColumns + 4) * 4;",
+        "factors = shared;",
+    ),
+    "a tile's sums are not multiplied": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "dev::multiply(of_column, of_row)",
+        "of_column",
+    ),
+    "a tile stores rows behind the last, whose squares it has": (
+        "hopper_tile.h",
+        "hopper_linear_bf16",
+        "(row0_ + row < end_row_ && n_ > 0)",
+        "n_ > 0",
+    ),
+    "a tile that begins a norm stores columns behind the last": (
+        "hopper_tile.h",
+        "hopper_linear_bf16",
+        "(row0_ + row < end_row_ && n_ > 0)",
+        "row0_ + row < end_row_",
+    ),
+    "residuals behind the last row are read": (
+        "hopper_tile.h",
+        "hopper_linear_bf16",
+        "Then::kTakesRows && row >= end_row_ ? row0_ : row",
+        "row",
+    ),
 }

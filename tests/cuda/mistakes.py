@@ -384,11 +384,21 @@ MISTAKES |= {
     "all pairs turn as those of the first head's first element": ("share.h", "linear_bf16", "+ column % rotation.d_head", ""),
     "both elements of a pair are the first one's sum": ("linear_bf16.cu", "linear_bf16", "high = add(column + half)", "high = add(column)"),
     "a half of the pairs is finished": ("linear_bf16.cu", "linear_bf16", "rotates ? job.n_column / 2 : job.n_column)", "rotates ? job.n_column / 4 : job.n_column)"),
+    # Norms that products begin and end.
+    "a norm without eps": ("share.h", "linear_strip", " + norm.eps)", ")"),
+    "a row's factor is that of its first part": ("share.h", "linear_bf16", "part < norm.n_part", "part < 1"),
+    "squares of a row lie side by side": ("share.h", "hopper_linear_bf16", "static_cast<std::int64_t>(part) * job.n_row + row", "static_cast<std::int64_t>(row) * norm.n_part + part"),
+    "a warp's rows alone have factors": ("linear_strip.cu", "linear_strip", "if (thread_index() < kStripRows)", "if (thread_index() < kLanes)"),
+    "shares of a strip are multiplied before they are added too": ("linear_strip.cu", "linear_strip", "job.n_split > 1 ? 1 : factor_of_row", "factor_of_row"),
+    "added shares are not multiplied": ("linear_bf16.cu", "linear_bf16", "factor = factor_of_row(job, row)", "factor = 1"),
+    "columns behind the last have squares": ("share.h", "linear_strip", "column + c < job.n_column ? y[c] * y[c] : 0", "y[c] * y[c]"),
+    "a part's squares are those of half of its lanes": ("share.h", "linear_strip", "mask = kLanesOfPart / 2;", "mask = kLanesOfPart / 4;"),
+    "weights of a norm are those of its first columns": ("share.h", "linear_strip", "norm.weight ? norm.weight[column + c]", "norm.weight ? norm.weight[c]"),
     "a job's blocks begin one too late": ("device.h", "linear_strip", "block >= jobs.end[i]", "block > jobs.end[i]"),
     # Rows in registers.
     "zeros behind a row's end count as values": ("rows.cu", "rows", "squares += place(j) < n ?", "squares += true ?"),
     "NaN keeps the device's bits": ("rows.cu", "rows", "rounded == rounded ?", "true ?"),
     "a long row is looked up from its beginning only": ("rows.cu", "rows", "static_cast<int>(blockIdx.y) * kLookupBlock", "0"),
 }
-TESTS = {"linear_strip": "*linear_float_test*", "linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*", "hopper_linear_int8": "*linear_int8_test*",
+TESTS = {"linear_strip": "*linear_float_test*,*halved_norm_test*", "linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*,*halved_norm_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*,*halved_norm_test*", "hopper_linear_int8": "*linear_int8_test*",
          "attention": "*attention_test*", "attention_f32": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*", "channel_attention": "*channel_attention_test*"}  # fmt: skip

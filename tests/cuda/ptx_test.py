@@ -38,6 +38,7 @@ STRIP_LOOPS = {
     for name in (
         *(f"linear_strip_{width}", f"linear_strip_{width}_gated"),
         *([f"linear_strips_{width}", f"linear_strip_{width}_rotated", f"linear_strips_{width}_rotated"] if width < 128 else []),
+        *([f"linear_strip_{width}_begins"] if width < 128 else []),
     )
 }
 # Of a tile for Hopper a warpgroup multiplies 128 bytes of the depth.

@@ -180,13 +180,14 @@ VLA_DEVICE void store_y(const Epilogue& e, std::int64_t row, int column, float f
   }
 }
 
-/// Stores y of two adjacent sums; the second may be after the last column.
-VLA_DEVICE void finish_pair(const Epilogue& e, const PairEnds& ends, float first, float second, std::int64_t row,
-                            int column) {
+/// Stores and returns y of two adjacent sums; the second may be after the last column.
+VLA_DEVICE float2 finish_pair(const Epilogue& e, const PairEnds& ends, float first, float second, std::int64_t row,
+                              int column) {
   const auto activated = [&](float x) { return activate(e.activation, x); };
   first = finish(e, ends.has_gate, first, ends.bias.x, ends.factor.x, ends.gate.x, ends.residual.x, activated);
   second = finish(e, ends.has_gate, second, ends.bias.y, ends.factor.y, ends.gate.y, ends.residual.y, activated);
   store_y(e, row, column, first, second, ends.has_second);
+  return {first, second};
 }
 VLA_DEVICE void finish_pair(const Epilogue& e, float first, float second, std::int64_t row, int column, int n_column) {
   finish_pair(e, load_ends(e, row, column, n_column), first, second, row, column);

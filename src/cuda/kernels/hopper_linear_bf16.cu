@@ -1,18 +1,26 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include "cuda/kernels/hopper_tile.h"
-#include "cuda/kernels/linear_bf16.h"
+#include "cuda/kernels/share.h"
 
 namespace vla::cuda {
 namespace {
 
-template <int kColumns_, int kRows_, bool kGated_>
+template <int kColumns_, int kRows_, bool kGated_, bool kBegins_ = false>
 struct Tile {
+  static constexpr bool kBegins = kBegins_;  // whether it begins a norm
   static constexpr bool kGated = kGated_;
   static constexpr int kColumns = kColumns_, kRows = kRows_, kThreads = kColumns * 2;
   static constexpr int kStages = hopper_stages(kColumns, kRows), kStage = hopper_stage_bytes(kColumns, kRows);
   static constexpr int kBytesW = kColumns * kSwizzledRow;
   static constexpr int kColumnsY = kGated ? kColumns / 2 : kColumns;
+};
+
+/// Begins a norm of y.
+struct BeginsNorm {
+  static constexpr bool kTakesRows = true;
+  const LinearBf16Job& job;
+  VLA_DEVICE void operator()(int row, int column, const float (&y)[4]) const { begin_norm<16, 4>(job, row, column, y); }
 };
 
 template <class T>
@@ -42,6 +50,7 @@ VLA_DEVICE void multiply(const LinearBf16Job& job, int block) {
     if (i < n) fetch_x(shared + i * T::kStage + T::kBytesW, first + i);
     dev::commit_copies();  // commits a group even if it is empty, because waiting counts groups
   }
+  const float factor = thread_index() < T::kRows ? factor_of_row(job, row0 + thread_index()) : 1;
   const std::uint64_t of_stage = T::kStage / 16;
   const std::uint64_t w0 = swizzled_descriptor(shared + thread_index() / 128 * 64 * kSwizzledRow);
   const std::uint64_t x0 = swizzled_descriptor(shared + T::kBytesW);
@@ -72,17 +81,27 @@ VLA_DEVICE void multiply(const LinearBf16Job& job, int block) {
   __syncthreads();  // the stages' memory is reused for sums
   using End = TileEnd<float, T::kColumns, T::kRows, T::kGated>;
   End::place(sum, shared);
+  std::byte* const factors = shared + T::kRows * (T::kColumns + 4) * 4;
+  static_assert(T::kRows <= T::kThreads && T::kRows * (T::kColumns + 5) * 4 <= T::kStages * T::kStage);
+  if (thread_index() < T::kRows) dev::write(factors + thread_index() * 4, factor);
   const End end(job, job.gate_bias, row0, column0);
-  const auto nothing = [](int) { return 0; };
-  if (job.partial)
-    end.leave(shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_sum(), nothing,
-              [](int, float of_column) { return static_cast<unsigned>(dev::bits_of(of_column)); });
+  const auto factor_of = [&](int row) { return dev::read<float>(factors + (row - row0) * 4); };
+  const auto scaled = [](float of_row, float of_column, int) { return dev::multiply(of_column, of_row); };
+  if constexpr (T::kBegins)
+    end.finish(shared, factor_of, scaled, BeginsNorm{job});
+  else if (job.partial)
+    end.leave(
+        shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_sum(), [](int) { return 0; },
+        [](int, float of_column) { return static_cast<unsigned>(dev::bits_of(of_column)); });
   else
-    end.finish(shared, nothing, [](int, float of_column, int) { return of_column; });
+    end.finish(shared, factor_of, scaled);
 }
 
 }  // namespace
 
+VLA_EARLY_KERNEL(hopper_linear_bf16_64x64_begins, 128, 1, LinearBf16Job) {
+  multiply<Tile<64, 64, false, true>>(job, static_cast<int>(blockIdx.y));
+}
 #define VLA_HOPPER_KERNEL(columns, rows)                                                   \
   VLA_EARLY_KERNEL(hopper_linear_bf16_##columns##x##rows, columns * 2, 1, LinearBf16Job) { \
     multiply<Tile<columns, rows, false>>(job, static_cast<int>(blockIdx.y));               \

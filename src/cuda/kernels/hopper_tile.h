@@ -41,6 +41,13 @@ class FetchRows {
   int n_left_, depth_, to_;
 };
 
+/// What a tile does with y besides storing it: nothing. If kTakesRows, it gets y of all rows and columns of the tile,
+/// in the same order in each lane of a warp, and there is no activation.
+struct LeavesY {
+  static constexpr bool kTakesRows = false;
+  VLA_DEVICE void operator()(int, int, const float (&)[4]) const {}
+};
+
 /// The end of a tile. Its sums pass through shared memory, in rows of kColumns words and four more against bank
 /// conflicts. A thread finishes the same four columns of every kRowsAtOnce-th row. Gated: the first half of a row holds
 /// the sums of the gate's matrix, the second half the other matrix's sums of the same columns.
@@ -54,6 +61,7 @@ class TileEnd {
       : e_(job.end),
         gate_bias_(gate_bias),
         row0_(row0),
+        end_row_(job.n_row),
         n_split_(job.n_split),
         n_column_(job.n_column),
         column_(column0 + thread_index() % kQuads * 4) {
@@ -86,15 +94,15 @@ class TileEnd {
       leave_rows<1, false>(sums, partial, of_row, word);
   }
   /// Computes y from value(of_row(row), a sum, index of the column among the thread's four), once all threads of the
-  /// block, or of the cluster, have called it.
-  template <class OfRow, class Value>
-  VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value) const {
+  /// block, or of the cluster, have called it. `then` also gets y, see LeavesY.
+  template <class OfRow, class Value, class Then = LeavesY>
+  VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value, Then then = {}) const {
     if (n_split_ == 1) {
       __syncthreads();  // sums of all warps are there
-      return finish_part<false>(sums, of_row, value);
+      return finish_part<false>(sums, of_row, value, then);
     }
     dev::meet_cluster();  // sums of all blocks are there
-    finish_part<true>(sums, of_row, value);
+    finish_part<true>(sums, of_row, value, then);
     dev::leave_cluster();  // no block reads them any more
   }
 
@@ -126,11 +134,17 @@ class TileEnd {
       }
   }
   /// kSplit: whether a cluster adds shares. Then the rare activations share code, since the shares' loads make it long.
-  template <bool kSplit, class OfRow, class Value>
-  VLA_DEVICE void finish_part(const std::byte* sums, OfRow of_row, Value value) const {
+  template <bool kSplit, class OfRow, class Value, class Then>
+  VLA_DEVICE void finish_part(const std::byte* sums, OfRow of_row, Value value, Then then) const {
     constexpr int kRowsAhead = kSplit ? 2 : 4;
-    const auto ahead = [&](auto activate) { finish_rows<kRowsAhead, true, kSplit>(sums, of_row, value, activate); };
-    const auto one = [&](auto activate) { finish_rows<1, false, kSplit>(sums, of_row, value, activate); };
+    const auto ahead = [&](auto activate) {
+      finish_rows<kRowsAhead, true, kSplit>(sums, of_row, value, activate, then);
+    };
+    const auto one = [&](auto activate) { finish_rows<1, false, kSplit>(sums, of_row, value, activate, then); };
+    if constexpr (Then::kTakesRows) {
+      const auto same = [](float x) { return x; };
+      return together_ ? ahead(same) : one(same);
+    }
     const bool is_rare = e_.activation != Activation::none && !is_sigmoid(e_.activation);
     if (!together_ || (kSplit && is_rare)) return one([&](float x) { return activate(e_.activation, x); });
     with_activation(e_.activation, ahead, [&](auto activate) {
@@ -139,17 +153,18 @@ class TileEnd {
   }
   /// Implements `finish` for one activation. Loads of kRowsAhead rows are in flight at a time, also of other blocks'
   /// sums.
-  template <int kRowsAhead, bool kTogether, bool kSplit, class OfRow, class Value, class Activate>
-  VLA_DEVICE void finish_rows(const std::byte* sums, OfRow of_row, Value value, Activate activate) const {
+  template <int kRowsAhead, bool kTogether, bool kSplit, class OfRow, class Value, class Activate, class Then>
+  VLA_DEVICE void finish_rows(const std::byte* sums, OfRow of_row, Value value, Activate activate, Then then) const {
     const auto load = [&](const float* from, std::int64_t at, float otherwise) {
       return from && n_ > 0 ? load_four(from + at, kTogether || together_, n_)
                             : Four{{otherwise, otherwise, otherwise, otherwise}};
     };
     const Four bias = load(e_.bias, column_, kAddsNothing), factor = load(e_.factor, column_, kScalesNothing);
     const Four gate_bias = load(kGated ? gate_bias_ : nullptr, column_, kAddsNothing);
+    const int end = Then::kTakesRows ? kRows : end_;
     const int part = kSplit ? static_cast<int>(blockIdx.z) : 0, apart = kRowsAtOnce * (kSplit ? n_split_ : 1);
 #pragma unroll 1
-    for (int first = thread_index() / kQuads + kRowsAtOnce * part; first < end_; first += apart * kRowsAhead) {
+    for (int first = thread_index() / kQuads + kRowsAtOnce * part; first < end; first += apart * kRowsAhead) {
       Four gate[kRowsAhead], residual[kRowsAhead];
       decltype(of_row(0)) of[kRowsAhead] = {};
       Sums sum[kRowsAhead] = {}, gate_sum[kRowsAhead] = {};
@@ -160,9 +175,10 @@ class TileEnd {
 #pragma unroll
       for (int i = 0; i < kRowsAhead; ++i) {
         const int row = row0_ + first + apart * i;
-        if (first + apart * i >= end_) break;
+        if (first + apart * i >= end) break;
         of[i] = of_row(row);
-        const std::int64_t at = static_cast<std::int64_t>(row) * n_column_ + column_;
+        const std::int64_t at =
+            static_cast<std::int64_t>(Then::kTakesRows && row >= end_row_ ? row0_ : row) * n_column_ + column_;
         gate[i] = load(kGated ? nullptr : e_.gate, at, 0);
         residual[i] = load(e_.residual, at, kAddsNothing);
         if constexpr (kSplit) read(i, row - row0_);
@@ -170,7 +186,7 @@ class TileEnd {
 #pragma unroll
       for (int i = 0; i < kRowsAhead; ++i) {
         const int row = first + apart * i;
-        if (row >= end_) break;
+        if (row >= end) break;
         if constexpr (!kSplit) read(i, row);
         if constexpr (kGated) {
 #pragma unroll
@@ -181,7 +197,9 @@ class TileEnd {
         for (int c = 0; c < 4; ++c)
           y.of[c] = cuda::finish(e_, kGated || e_.gate != nullptr, value(of[i], sum[i].of[c], c), bias.of[c],
                                  factor.of[c], gate[i].of[c], residual[i].of[c], activate);
-        store_y(e_, row0_ + row, column_, y, kTogether || together_, n_);
+        if (!Then::kTakesRows || (row0_ + row < end_row_ && n_ > 0))
+          store_y(e_, row0_ + row, column_, y, kTogether || together_, n_);
+        then(row0_ + row, column_, y.of);
       }
     }
   }
@@ -216,7 +234,7 @@ class TileEnd {
 
   const Epilogue& e_;
   const float* gate_bias_;
-  int row0_, n_split_, n_column_, column_, n_, end_;  // n_: columns from column_ on; end_: rows to finish
+  int row0_, end_row_, n_split_, n_column_, column_, n_, end_;  // n_: columns from column_ on; end_: rows to finish
   bool together_;
 };
 

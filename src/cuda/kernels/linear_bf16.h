@@ -21,6 +21,20 @@ struct Rotation {
   }
 };
 
+/// The first half of an RMS norm of y; products of the norm do the other half (NormEnd).
+struct NormBegin {
+  std::uint16_t* rows = nullptr;  // y * weight in bf16, with a stride that is even; null: no norm begins
+  std::int64_t stride = 0;
+  const float* weight = nullptr;  // [n_column], or null
+  float* squares = nullptr;       // [n_row, n_part]: sums of y * y over parts of each row, see norm_part()
+};
+/// The other half: x is such rows, so sums are multiplied by their row's 1 / sqrt(mean of squares + eps).
+struct NormEnd {
+  const float* squares = nullptr;  // [n_row, n_part]; null: x has no norm to end
+  int n_part = 0;
+  float eps = 0;
+};
+
 struct LinearBf16Job {
   // n_row rows with stride x_stride: float32 for few rows, else bf16 with a stride that is a multiple of 8
   const void* x;
@@ -39,6 +53,11 @@ struct LinearBf16Job {
   const float* gate_bias = nullptr;
   /// Only for strips of up to 64 columns, or where finish_bf16_partial adds the shares: y = rotated(x w^T + bias).
   Rotation rotation = {};
+  /// Only for undivided strips of up to 64 columns without halves, and Hopper's tiles that have a kernel for it, if
+  /// they compute y: without activation, gate and final ReLU.
+  NormBegin norm_begin = {};
+  /// Not for `few`, rows64 and rows128, unless finish_bf16_partial adds the shares.
+  NormEnd norm_end = {};
 
   VLA_HOST_DEVICE int n_sum() const { return gate_weight ? 2 * n_column : n_column; }  // per row
 };
@@ -65,18 +84,24 @@ constexpr unsigned strip_width(Bf16Shape shape) {
       return 0;
   }
 }
+/// Columns of a part of NormBegin's rows, for strips of this width; 64 for Hopper's tiles.
+constexpr int norm_part(unsigned width) { return width < 64 ? static_cast<int>(width) : 64; }
 inline Launch linear_strip(unsigned width, const LinearBf16Job& job) {
-  constexpr const char* kNames[3][4] = {
+  constexpr const char* kNames[4][4] = {
       {"linear_strip_16", "linear_strip_32", "linear_strip_64", "linear_strip_128"},
       {"linear_strip_16_gated", "linear_strip_32_gated", "linear_strip_64_gated", "linear_strip_128_gated"},
-      {"linear_strip_16_rotated", "linear_strip_32_rotated", "linear_strip_64_rotated"}};
-  const int kind = job.gate_weight != nullptr ? 1 : job.rotation.table != nullptr && job.n_split == 1 ? 2 : 0;
+      {"linear_strip_16_rotated", "linear_strip_32_rotated", "linear_strip_64_rotated"},
+      {"linear_strip_16_begins", "linear_strip_32_begins", "linear_strip_64_begins"}};
+  const int kind = job.gate_weight != nullptr                          ? 1
+                   : job.rotation.table != nullptr && job.n_split == 1 ? 2
+                   : job.norm_begin.rows != nullptr                    ? 3
+                                                                       : 0;
   const int which = width == 16 ? 0 : width == 32 ? 1 : width == 64 ? 2 : 3;
   const unsigned n_sum = width == 128 ? 2 : width == 64 ? 4 : 8;  // warps that have the same columns
   return {kNames[kind][which],
           {blocks(job.n_sum(), width), blocks(job.n_row, 64), static_cast<unsigned>(job.n_split)},
           256,
-          n_sum * 64 * (width + 8) * 4};
+          (n_sum * 64 * (width + 8) + 64) * 4};
 }
 /// Several products in strips of the same width, rows and depth, without gates and splits. If any is rotated, all must
 /// have a multiple of four columns.
@@ -136,6 +161,9 @@ constexpr HopperTile kHopperTiles[] = {
             VLA_HOPPER_GATED_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 };
+/// The first tile also has a kernel that begins a norm.
+constexpr std::size_t kHopperBegins = 0;
+constexpr const char* kHopperBeginsKernel = "hopper_linear_bf16_64x64_begins";
 constexpr int kHopperDepth = 64;  // step of the depth, and unit of a split: each share has at least one
 /// Bytes of a step, and the number of steps in shared memory: eight, or fewer if kHopperShared holds fewer.
 constexpr int hopper_stage_bytes(int columns, int rows) { return (columns + rows) * kHopperDepth * 2; }
@@ -145,7 +173,7 @@ constexpr int hopper_stages(int columns, int rows) {
 }
 inline Launch hopper_linear_bf16(const HopperTile& tile, const LinearBf16Job& job) {
   // Adjacent blocks read the same columns, so the matrix is read from memory once.
-  return {tile.kernel,
+  return {job.norm_begin.rows != nullptr ? kHopperBeginsKernel : tile.kernel,
           {blocks(job.n_row, tile.rows), blocks(job.n_column, tile.is_gated ? tile.columns / 2 : tile.columns),
            static_cast<unsigned>(job.n_split)},
           static_cast<unsigned>(tile.columns) * 2,

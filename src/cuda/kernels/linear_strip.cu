@@ -13,9 +13,11 @@ enum class Halves { none, gated, rotated };
 
 /// A block computes sums of up to 64 rows and kColumns columns. A warp has kTilesN * 8 of the columns; warps with the
 /// same columns take the steps of the depth in turn.
-template <int kTilesN_, int kWarpsN_, Halves kHalves>
+template <int kTilesN_, int kWarpsN_, Halves kHalves, bool kBegins_ = false>
 struct Strip {
   static constexpr int kTilesN = kTilesN_, kWarpsN = kWarpsN_, kWarpsK = kWarps / kWarpsN;
+  static constexpr bool kBegins = kBegins_;  // whether it begins a norm
+  static_assert(!kBegins || kHalves == Halves::none);
   static constexpr bool kGated = kHalves == Halves::gated, kRotated = kHalves == Halves::rotated;
   static constexpr int kColumns = kTilesN * 8 * kWarpsN;
   static constexpr int kColumnsY = kHalves == Halves::none ? kColumns : kColumns / 2;  // of y, or pairs
@@ -104,7 +106,13 @@ struct Stores {
   }
 };
 
-/// Adds the sums of the warps that share two columns, from `column` on, in the warps' order.
+/// Where shared memory has the factor of a row's sums.
+template <class S>
+VLA_DEVICE std::byte* place_of_factor(int row) {
+  return dev::shared_memory() + S::kWarpsK * kStripRows * S::kRowBytes + row * 4;
+}
+/// Adds the sums of the warps that share two columns, from `column` on, in the warps' order, and multiplies by the
+/// row's factor.
 template <class S>
 VLA_DEVICE float2 add_warps(int row, int column) {
   float2 sum = {0, 0};
@@ -113,10 +121,11 @@ VLA_DEVICE float2 add_warps(int row, int column) {
     const auto pair = dev::read<float2>(dev::shared_memory() + (w * kStripRows + row) * S::kRowBytes + column * 4);
     sum.x += pair.x, sum.y += pair.y;
   }
-  return sum;
+  const auto factor = dev::read<float>(place_of_factor<S>(row));
+  return {dev::multiply(sum.x, factor), dev::multiply(sum.y, factor)};
 }
 
-/// Adds the sums of warps that share columns, and stores pairs of y.
+/// Adds the sums of warps that share columns, stores pairs of y, and begins a norm of it if the strip does that.
 template <class S>
 VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
   const Stores<S> mine;
@@ -132,6 +141,12 @@ VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
     const int row = mine.row(i);
     const float2 gate = S::kGated ? add_warps<S>(row, mine.column) : float2{0, 0};
     const float2 sum = add_warps<S>(row, S::kColumns - S::kColumnsY + mine.column);
+    if constexpr (S::kBegins) {
+      float2 y = {0, 0};
+      if (valid(row)) y = finish_pair(job.end, ends[i], sum.x, sum.y, row0 + row, column);
+      begin_norm<S::kColumns / 2, 2>(job, row0 + row, column, {y.x, y.y});
+      continue;
+    }
     if (!valid(row)) continue;
     if (job.n_split > 1) {
       const bool has_second = column + 1 < job.n_column;
@@ -193,6 +208,8 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job, int block) {
   dev::wait_for_earlier();
 #pragma unroll
   for (int i = 0; i < S::kAhead; ++i) operands.load_x(ahead[i], first + i * S::kWarpsK);
+  if (thread_index() < kStripRows)
+    dev::write(place_of_factor<S>(thread_index()), job.n_split > 1 ? 1 : factor_of_row(job, row0 + thread_index()));
   float sum[kTilesM][S::kTilesN][4] = {};
 #pragma unroll 1
   for (int step = first; step < share.end; step += S::kAhead * S::kWarpsK) {
@@ -235,6 +252,9 @@ VLA_STRIP(16, 2, 1, Halves::none)
 VLA_STRIP(32, 4, 1, Halves::none)
 VLA_STRIP(64, 4, 2, Halves::none)
 VLA_STRIP(128, 4, 4, Halves::none)
+VLA_STRIP(16_begins, 2, 1, Halves::none, true)
+VLA_STRIP(32_begins, 4, 1, Halves::none, true)
+VLA_STRIP(64_begins, 4, 2, Halves::none, true)
 VLA_STRIP(16_gated, 2, 1, Halves::gated)
 VLA_STRIP(16_rotated, 2, 1, Halves::rotated)
 VLA_STRIP(32_gated, 4, 1, Halves::gated)

@@ -133,7 +133,10 @@ class Bench {
   Status run_hopper(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Buffer& partial,
                     const Epilogue& end) {
     const std::int64_t stride = round_up(size.depth, 8);
+    const std::int64_t stride_of_rows = round_up(size.n_column, 2);
     VLA_TRY(const Buffer bias, timer_.upload(numbers_.floats(size.n_column)));
+    VLA_TRY(const Buffer rows, timer_.gpu().allocate(bytes(2 * size.n_row * stride_of_rows), "rows of a norm"));
+    VLA_TRY(const Buffer squares, timer_.gpu().allocate(bytes(4 * size.n_row * blocks(size.n_column, 64)), "squares"));
     for (const HopperTile& tile : kHopperTiles)
       for (const auto& [n_split, in_cluster] : kHopperSplits) {
         // Both matrices of a gated product, each of half of the columns, are as much work.
@@ -150,6 +153,13 @@ class Bench {
         if (jobs[0].partial != nullptr) launches.push_back(finish_bf16_partial(jobs[0]));
         const std::string name = shape_name(tile.kernel, in_cluster);
         VLA_CHECK(tell(tile.is_gated ? "bf16 gated" : "bf16", size, name.c_str(), n_split, jobs, launches));
+        if (&tile == &kHopperTiles[kHopperBegins] && jobs[0].partial == nullptr) {
+          for (LinearBf16Job& job : jobs)
+            job.norm_begin = {rows.as<std::uint16_t>(), stride_of_rows, bias.as<float>(), squares.as<float>()};
+          launches = {hopper_linear_bf16(tile, jobs[0])};
+          VLA_CHECK(tell("bf16, begins norm", size, name.c_str(), n_split, jobs, launches));
+          for (LinearBf16Job& job : jobs) job.norm_begin = {};
+        }
         if (tile.is_gated || n_split > 1 || size.n_row <= 64) continue;
         // What a vision tower's first product of an MLP ends in.
         for (LinearBf16Job& job : jobs)
