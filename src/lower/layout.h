@@ -24,15 +24,6 @@ class Layouts {
       step.reads.push_back(id);
     }
   }
-  /// Adds a value that the target makes. `row`: elements from one row to the next.
-  ValueId add_value(Shape shape, DType type, std::int64_t row) {
-    const auto id = static_cast<ValueId>(l.values.size());
-    const Shape padded = {row, shape[1], shape[2], shape[3]};
-    Value& value = l.values.emplace_back();
-    value.type = type, value.shape = shape, value.stride = contiguous_strides(padded), value.base = id;
-    value.size = dtype_size(type, count(padded));
-    return id;
-  }
   /// Makes a product read x, or its norm, in another type. The first such product adds the conversion; later ones share
   /// it.
   void round(const Step& step, LinearOp& op, DType type, std::int64_t row, const char* verb) {
@@ -46,7 +37,7 @@ class Layouts {
                       .verb = verb};
       Step before = {.order = step.order};
       meet(before, made.operands());
-      known->second = add_value(l.value(made.x).shape, type, row);
+      known->second = add_value(l, l.value(made.x).shape, type, row);
       before.writes = {known->second};
       l.ops.push_back({std::move(before), std::move(made)});
     }
@@ -65,7 +56,7 @@ class Layouts {
   /// Adds a contiguous copy of a value.
   ValueId copied(ValueId id, int order) {
     const Value from = l.value(id);
-    const ValueId copy = add_value(from.shape, from.type, from.shape[0]);
+    const ValueId copy = add_value(l, from.shape, from.type, from.shape[0]);
     Value& to = l.value(copy);
     to.node = from.node;
     l.ops.push_back({{.reads = {id}, .writes = {copy}, .order = order},

@@ -98,6 +98,8 @@ inline ValueId operand(const Node& node, std::size_t i) { return i < node.in.siz
 
 /// Makes a value of every node: memory of its own, or a view.
 void start(Lowering& l);
+/// Adds a value that the target makes. `row`: elements from one row to the next.
+ValueId add_value(Lowering& l, Shape shape, DType type, std::int64_t row);
 /// Puts steps that do not depend on each other into one phase, and invariant steps into Program::prepare.
 void schedule(Lowering& l, std::vector<Step*> steps);
 /// Sets Value::begin: places of values in the arena or in the program's own memory.

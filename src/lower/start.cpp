@@ -140,4 +140,13 @@ void start(Lowering& l) {
   for (const Node& node : l.graph.nodes()) l.values.push_back(std::visit(MakeValue{l, node}, node.op));
 }
 
+ValueId add_value(Lowering& l, Shape shape, DType type, std::int64_t row) {
+  const auto id = static_cast<ValueId>(l.values.size());
+  const Shape padded = {row, shape[1], shape[2], shape[3]};
+  Value& value = l.values.emplace_back();
+  value.type = type, value.shape = shape, value.stride = contiguous_strides(padded), value.base = id;
+  value.size = dtype_size(type, count(padded));
+  return id;
+}
+
 }  // namespace vla::lower

@@ -46,6 +46,15 @@ struct HeadRotation {
   std::int64_t d_head = 0, n_token = 0;
 };
 
+/// An RMS norm that one product begins and others end (cuda::NormBegin, cuda::NormEnd).
+struct HalvedNorm {
+  ValueId squares = kNone;  // [n_row, n_part]; kNone: there is no such norm
+  ValueId rows = kNone;     // what the norm's products read
+  ValueId weight = kNone;
+  int n_part = 0;
+  float eps = 0;
+};
+
 struct CudaOp : Step {
   AnyOp<HeadOp> op;
   ProductCut cut = {};         // LinearOp only
@@ -53,6 +62,8 @@ struct CudaOp : Step {
   ValueId gate = kNone;        // the gate product's result, if no kernel computes gate and up together
   ValueId partial = kNone;     // partial results of the shares of the depth or of the keys; none of a cluster
   HeadRotation rotation = {};  // LinearOp only
+  HalvedNorm begins = {};      // LinearOp only: of its result
+  HalvedNorm ends = {};        // LinearOp only: of its x
   std::shared_ptr<const CudaOp> finishes = nullptr;  // norms only: the product whose depth shares are added first
 };
 /// Whether another operation adds the depth shares of this product.
@@ -86,18 +97,32 @@ struct CudaLowering : Lowering {
 /// value whose only reader is such a conversion is stored converted, and some products rotate the heads that they make.
 /// Also splits the depth of products, and lets norms add the shares.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
+/// Lets products begin and end RMS norms where that is faster than an operation for the norm, and removes those
+/// operations. For a step of choose_layouts, before shares have values.
+void halve_norms(CudaLowering& l);
+/// The operation whose first result is this value, or null.
+CudaOp* maker_of(CudaLowering& l, ValueId id);
+
+/// Whether a bf16 product of this many rows uses strips. With more rows, tiles of both operands in shared memory are
+/// faster despite their barriers.
+bool is_of_strips(std::int64_t n_row, std::int64_t depth);
 
 /// The strip width, 16 to 64, for several products in one launch without split depth.
 unsigned common_width(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm);
-/// What a Hopper tile computes: one product, both products of a gated MLP, or several products in one launch. Each has
-/// its own set of tiles.
-enum class HopperCutFor { one, gated, several };
+/// What a Hopper tile computes: one product, both products of a gated MLP, several products in one launch, or one
+/// product and the first half of a norm of it, whose shares no other kernel adds. Each has its own set of tiles.
+enum class HopperCutFor { one, gated, several, begins_norm };
 /// The Hopper tile with the shortest estimated time. n_column: columns of all products together.
 ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
                           HopperCutFor what, int n_sm);
 /// Chooses the fastest cut. is_gated: one kernel computes gate and up, which have n_column columns together.
 ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
                        std::int64_t depth, bool is_gated);
+
+/// The fastest cut of a product that begins a norm; infinitely slow if no kernel does that.
+ProductCut cut_to_begin_norm(const CudaLowering& l, std::int64_t n_row, std::int64_t n_column, std::int64_t depth);
+/// Estimated microseconds of a product and of the kernel of a norm after it, which adds the product's shares.
+double us_with_norm(const ProductCut& cut);
 
 /// The tensor-core plan with the shortest estimated time. n_row: query rows per key head. n_unit: key heads of the
 /// whole batch.

@@ -61,8 +61,9 @@ Result<std::vector<int>> CudaProgram::make_parts(const CudaLowering& l) {
   reads_.resize(phases.size());
   for (const CudaOp& op : l.ops) {
     VLA_TRY(Calls calls, std::visit([&](const auto& what) { return calls_of(l, op, what); }, op.op));
-    const std::string text =
-        std::visit([](const auto& what) { return what.text(); }, op.op) + (op.rotation.table != kNone ? ", rope" : "");
+    const std::string text = std::visit([](const auto& what) { return what.text(); }, op.op) +
+                             (op.rotation.table != kNone ? ", rope" : "") +
+                             (op.begins.squares != kNone ? ", begins norm" : "");
     const Work work = work_of(l, op);
     if (!op.invariant) work_[stage_of(l, op)] += work;
     text_ += line_of(l, op, calls.empty() ? "nothing" : calls.front().how.kernel, text, work) + "\n";

@@ -72,6 +72,7 @@ std::vector<Candidate> candidates(MatrixKind kind, HopperCutFor what) {
   if (kind == MatrixKind::bf16)
     for (std::size_t i = 0; i < std::size(cuda::kHopperTiles); ++i) {
       const auto& [kernel, columns, rows, is_gated, several] = cuda::kHopperTiles[i];
+      if (what == HopperCutFor::begins_norm && i != cuda::kHopperBegins) continue;
       if (is_gated != (what == HopperCutFor::gated) || (what == HopperCutFor::several && several == nullptr)) continue;
       all.push_back({i, columns, rows, (columns + rows) * 128});
     }
@@ -100,6 +101,7 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
       const std::int64_t n_whole = ceil_div(n_row, tile.rows) * ceil_div(n_column, tile.columns);
       if (n_split > 1 && n_step / n_split < (is_bf16 || n_split > 4 ? 4 : 1)) break;
       if (!is_bf16 && n_whole * (n_split - 1) > 2 * n_sm) break;
+      if (what == HopperCutFor::begins_norm && n_split > 1 && !in_cluster) continue;
       const auto size = static_cast<double>(tile.columns * tile.rows);
       const std::int64_t n_of_y = what == HopperCutFor::gated ? tile.columns / 2 : tile.columns;
       const auto n_used = static_cast<double>(std::min(tile.rows, n_row));

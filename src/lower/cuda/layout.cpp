@@ -1,11 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
-#include <limits>
 #include <map>
 
 #include "cuda/kernels/linear_bf16.h"
-#include "cuda/kernels/linear_int8.h"
 #include "cuda/kernels/rows.h"
 #include "kernels/quantized.h"
 #include "lower/cuda/cuda_lowering.h"
@@ -13,12 +11,6 @@
 
 namespace vla::lower {
 namespace {
-
-/// Whether a bf16 product of this many rows uses strips. With more rows, tiles of both operands in shared memory are
-/// faster despite their barriers.
-bool is_of_strips(std::int64_t n_row, std::int64_t depth) {
-  return n_row > cuda::kBf16FewRows && n_row <= 64 && depth % 8 == 0;
-}
 
 class CudaLayouts final : Layouts<CudaLowering> {
  public:
@@ -37,6 +29,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     for (CudaOp& op : l.ops)
       if (auto* head = std::get_if<HeadOp>(&op.op)) rotate_at_once(op, head->rows);
     std::erase_if(l.ops, [](const CudaOp& op) { return op.writes.empty(); });
+    halve_norms(l);
     for (CudaOp& op : l.ops)
       if (const auto* product = std::get_if<LinearOp>(&op.op); product != nullptr && !op.cut.in_cluster)
         split(op, op.cut.n_split, n_sum(op, *product));
@@ -45,7 +38,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
   }
 
  private:
-  ValueId add_rows(const Shape& shape, DType type = DType::f32) { return add_value(shape, type, shape[0]); }
+  ValueId add_rows(const Shape& shape, DType type = DType::f32) { return add_value(l, shape, type, shape[0]); }
 
   template <class Op>
   CudaOp& add_op(Step step, Op op) {
@@ -137,19 +130,13 @@ class CudaLayouts final : Layouts<CudaLowering> {
   void split(CudaOp& op, int n_split, std::int64_t n) {
     if (n_split > 1) op.writes.push_back(op.partial = add_rows({n, n_split, 1, 1}));
   }
-  /// The operation whose first result is this value, or null.
-  CudaOp* maker_of(ValueId id) {
-    const auto makes = [&](const CudaOp& op) { return !op.writes.empty() && op.writes[0] == id; };
-    const auto maker = std::ranges::find_if(l.ops, makes);
-    return maker != l.ops.end() ? &*maker : nullptr;
-  }
   /// Stores the result of a product, attention or window rounded if `round` is its only reader.
   void round_at_once(CudaOp& round, const RoundOp& what) {
     const Value &x = l.value(what.x), &to = l.value(round.writes[0]);
     const bool is_whole =
         x.base == what.x && x.placement == Value::Placement::arena && x.node != nullptr && !x.node->tapped;
     if (what.norm != nullptr || to.type != DType::bf16 || !is_whole || n_reader_[what.x] != 1) return;
-    CudaOp* const maker = maker_of(what.x);
+    CudaOp* const maker = maker_of(l, what.x);
     if (maker == nullptr) return;
     const bool is_attention = std::holds_alternative<AttentionOp>(maker->op) && x.shape[0] % 8 == 0;
     const bool is_other = std::holds_alternative<LinearOp>(maker->op) || std::holds_alternative<WindowOp>(maker->op);
@@ -162,7 +149,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     const Value &x = l.value(rows.x), &base = l.base(rows.x);
     const bool is_whole = is_contiguous(x) && x.offset == 0 && count(x.shape) == count(base.shape) &&
                           base.placement == Value::Placement::arena && !is_tapped(x.base);
-    CudaOp* const maker = is_whole && n_reader_[x.base] == 1 ? maker_of(x.base) : nullptr;
+    CudaOp* const maker = is_whole && n_reader_[x.base] == 1 ? maker_of(l, x.base) : nullptr;
     return maker != nullptr && std::holds_alternative<LinearOp>(maker->op) ? maker : nullptr;
   }
   /// Lets a product store the heads that it makes as `head` would, and removes the operation `head`.
@@ -185,7 +172,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     if (rows.norm != nullptr || rows.rope == nullptr || x[0] % 8 != 0) return;
     CudaOp* const maker = maker_of_heads(rows);
     if (maker == nullptr || !rotates(*maker)) return;
-    const CudaOp* const of_table = maker_of(l.value(rows.table).base);
+    const CudaOp* const of_table = maker_of(l, l.value(rows.table).base);
     if (of_table != nullptr && of_table->order >= maker->order) return;
     make_at_once(*maker, head);
     maker->rotation = {rows.table, x[0], x[2]};
@@ -206,7 +193,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     const Value& x = l.value(what.x);
     const bool is_whole = x.base == what.x && x.placement == Value::Placement::arena && !is_tapped(what.x);
     if (what.norm == nullptr || !is_whole || x.shape[0] > cuda::kMostFinished) return;
-    CudaOp* const maker = maker_of(what.x);
+    CudaOp* const maker = maker_of(l, what.x);
     if (maker == nullptr || !leaves_plain_shares(*maker)) return;
     const auto reads_first = [&](const CudaOp& op) {
       return std::pair(op.order, &op) < std::pair(norm.order, static_cast<const CudaOp*>(&norm)) &&
@@ -226,9 +213,9 @@ class CudaLayouts final : Layouts<CudaLowering> {
   bool leaves_plain_shares(const CudaOp& op) const {
     const auto* product = std::get_if<LinearOp>(&op.op);
     return product != nullptr && product->linears.size() == 1 && op.partial != kNone && !leaves_shares(op) &&
-           op.cut.n_split <= cuda::kMostSplits && l.matrix(*product->linears[0]).kind == MatrixKind::bf16 &&
-           l.value(op.writes[0]).type == DType::f32 && product->activation == Activation::none &&
-           !product->ends_in_relu;
+           op.cut.n_split <= cuda::kMostSplits && op.ends.squares == kNone &&
+           l.matrix(*product->linears[0]).kind == MatrixKind::bf16 && l.value(op.writes[0]).type == DType::f32 &&
+           product->activation == Activation::none && !product->ends_in_relu;
   }
   /// Whether a value or a view of it is tapped.
   bool is_tapped(ValueId base) const {
@@ -254,73 +241,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
   std::map<ValueId, int> n_reader_;  // readers of each base and its views
 };
 
-std::int64_t blocks_of(std::int64_t n_row, std::int64_t n_column, std::int64_t rows, std::int64_t columns) {
-  return ceil_div(n_row, rows) * ceil_div(n_column, columns);
-}
-
-/// Estimated microseconds of a strip kernel, from measurements on an H200: a warp takes a fixed time per step of the
-/// depth; the kernel that adds shares takes 2 us plus the traffic of its sums.
-double strip_us(std::int64_t width, int n_split, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
-                int n_sm) {
-  constexpr double kBegin = 2, kOfAll = 2.5e6, kFinish = 2;
-  const std::int64_t n_block = blocks_of(n_row, n_column, 64, width) * n_split;
-  const std::int64_t n_warp = width <= 32 ? 8 : 256 / width;  // warps that share the depth
-  const std::int64_t of_warp = ceil_div(depth, cuda::kBf16Depth * n_warp * n_split);
-  const double of_step = width == 16 ? 0.85 : 1.4;
-  const double us = kBegin + static_cast<double>(ceil_div(n_block, n_sm) * of_warp) * of_step;
-  return n_split == 1 ? us : us + kFinish + static_cast<double>(2 * 4 * n_row * n_column * n_split) / kOfAll;
-}
-
-/// The strip width and number of shares with the shortest time.
-ProductCut cut_in_strips(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
-  using enum cuda::Bf16Shape;
-  ProductCut best = {.us = std::numeric_limits<double>::max()};
-  for (const cuda::Bf16Shape shape : {strip16, strip32, strip64, strip128})
-    for (const int n_split : {1, 2, 4, 8}) {
-      if (n_split > 1 && depth / n_split < 8 * cuda::kBf16Depth) break;
-      const double us = strip_us(strip_width(shape), n_split, n_row, n_column, depth, n_sm);
-      if (us < best.us) best = {.shape = shape, .n_split = n_split, .us = us};
-    }
-  return best;
-}
-
 }  // namespace
-
-unsigned common_width(std::int64_t n_row, std::int64_t n_column, std::int64_t depth, int n_sm) {
-  const auto us = [&](unsigned width) { return strip_us(width, 1, n_row, n_column, depth, n_sm); };
-  return std::min({16U, 32U, 64U}, [&](unsigned a, unsigned b) { return us(a) < us(b); });
-}
-
-ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
-                       std::int64_t depth, bool is_gated) {
-  const int n_sm = l.n_sm;
-  const bool is_bf16 = kind == MatrixKind::bf16, is_few = n_row <= (is_bf16 ? cuda::kBf16FewRows : 4);
-  // No Hopper tile expands int4 codes.
-  const bool has_tiles = l.is_hopper && kind != MatrixKind::f32 && kind != MatrixKind::int4 && !is_few;
-  const HopperCutFor tables = is_gated ? HopperCutFor::gated : HopperCutFor::one;
-  if (is_bf16 && is_of_strips(n_row, depth)) {
-    const ProductCut strips = cut_in_strips(n_row, n_column, depth, n_sm);
-    if (!has_tiles) return strips;
-    // Measured: tiles of few rows, with the kernel that adds their shares, take this many microseconds more than
-    // estimated.
-    constexpr double kMore = 1.5;
-    const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
-    return tiles.us + kMore < strips.us ? tiles : strips;
-  }
-  if (has_tiles) return cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
-  const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
-  using enum cuda::Bf16Shape;
-  const cuda::Bf16Shape shape = is_few ? few : n_row > 64 && n_large >= n_sm ? rows128 : rows64;
-  if (kind == MatrixKind::f32) return {shape, 1};
-  std::int64_t n_block = shape == rows128 ? n_large : blocks_of(n_row, n_column, 64, 64);
-  if (is_few) n_block = blocks_of(1, n_column, 1, is_bf16 ? 8 : 128);
-  // A share has at least `least` steps. The depth is split only if there are fewer blocks than SMs. Codes allow fewer
-  // steps per share: their steps are twice as deep, and one kernel that adds many shares is faster than the epilogues
-  // of a few blocks.
-  const std::int64_t step = is_bf16 ? cuda::kBf16Depth : cuda::Int8Tile::kDepth, least = is_bf16 ? 8 : 3;
-  const std::int64_t most = std::max<std::int64_t>(ceil_div(depth, step) / least, 1);
-  return {shape, static_cast<int>(std::clamp<std::int64_t>(n_sm / std::max<std::int64_t>(n_block, 1), 1, most))};
-}
 
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops) { CudaLayouts(l).run(std::move(ops)); }
 

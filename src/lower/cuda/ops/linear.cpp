@@ -15,6 +15,11 @@ cuda::Int8Shape int8_shape(cuda::Bf16Shape shape) {
                                             : cuda::Int8Shape::rows128;
 }
 
+cuda::NormBegin norm_begin(const CudaLowering& l, const HalvedNorm& norm) {
+  if (norm.squares == kNone) return {};
+  return {l.at<std::uint16_t>(norm.rows), l.value(norm.rows).stride[1], l.at(norm.weight), l.at(norm.squares)};
+}
+
 /// gate: the gate product, if the same kernel computes it with this one; else null.
 void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const CudaWeight& matrix, const Param& weight,
                  const cuda::Epilogue& end, const op::Linear* gate, Calls& calls) {
@@ -47,7 +52,9 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
           .end = end,
           .gate_weight = gate ? l.param<std::uint16_t>(gate->weight) : nullptr,
           .gate_bias = gate ? l.param(gate->bias) : nullptr,
-          .rotation = {l.at(op.rotation.table), narrow(op.rotation.d_head), narrow(op.rotation.n_token)}};
+          .rotation = {l.at(op.rotation.table), narrow(op.rotation.d_head), narrow(op.rotation.n_token)},
+          .norm_begin = norm_begin(l, op.begins),
+          .norm_end = {l.at(op.ends.squares), op.ends.n_part, op.ends.eps}};
       calls.push_back(
           call(tile ? cuda::hopper_linear_bf16(cuda::kHopperTiles[*tile], job) : cuda::linear_bf16(shape, job), job));
       if (op.partial != kNone && !leaves_shares(op)) calls.push_back(call(cuda::finish_bf16_partial(job), job));
