@@ -69,6 +69,14 @@ def families(result):
     return table(head, rows)
 
 
+def ways(result):
+    """Networks without each of the ways that estimates chose (VLA_CUDA_WITHOUT)."""
+    names = sorted({way for found in result["families"].values() for way in found.get("without") or {}})
+    rows = [[f"`{name}`", number(get(found, "stored", "ms", "network")), *(number(get(found, "without", way, "ms", "network")) for way in names)]
+            for name, found in sorted(result["families"].items()) if found.get("without")]
+    return table(["network, ms", "with all ways", *(f"without {way}" for way in names)], rows)
+
+
 def kernels(result):
     """The kernels that take most of an act, of families that were traced."""
     rows = []
@@ -97,7 +105,7 @@ def processor(result):
 
 def section(result, is_newest):
     """Of a visit: what it ran and acts; of a card's newest one, its kernels and products too."""
-    details = [*kernels(result), *products(result)] if is_newest else []
+    details = [*ways(result), *kernels(result), *products(result)] if is_newest else []
     return "\n".join([title(result), *families(result), *details, *processor(result)]) + "\n"
 
 

@@ -15,6 +15,7 @@ OUT/result.json is the result, OUT/log.txt all that was said. The stages, in ord
     cases      golden cases of every architecture: each value within 1e-4 of the reference in float32, chunks within PyTorch's own error in bf16
     families   acts of policies of their published sizes, with random weights, and what was predicted where there is a model of this GPU;
                each kernel of an act, where this Python has PyTorch
+    ways       the same acts without each of the ways to lower a graph that were chosen by estimates (VLA_CUDA_WITHOUT)
     torch      LeRobot's own networks at the same sizes, where the Python of --torch has PyTorch and LeRobot
     products   matrix products and attention in all shapes of blocks, and cuBLAS where this Python has PyTorch
     cpu        the same acts on this machine's processor
@@ -37,6 +38,7 @@ KIT = Path(__file__).resolve().parent
 VLA, TINY = KIT / "bin/vla", KIT / "tiny/policy.gguf"
 # Of the largest action: sums in another order; bf16 beside float32; codes, where what lies between products is rounded in other places.
 TOLERANCE = {"float32": 1e-4, "bf16": 3e-2, "int8": 1e-1, "int4": 1e-1}
+WAYS = ("clusters", "adders", "halved-norms", "rotations")  # in src/lower/cuda/cuda_ways.cpp
 MODELS = {"H100": "h100", "H200": "h200", "5090": "rtx-5090", "3060": "rtx-3060", "Orin": "orin-agx"}  # in a card's name: vla bench --model
 
 
@@ -200,11 +202,11 @@ def medians(report):
     return {"ms": {name: stage["p50_ms"] for name, stage in report["stages"].items()}, "load_ms": report["load_ms"], "rounds": len(report["rounds"])}
 
 
-def bench(visit, name, family, options, limit):
+def bench(visit, name, family, options, limit, **environment):
     """vla bench of the published size; of the small policy on the driver of tests."""
     what = [TINY] if visit.options.driver else ["--arch", family, "--size", "full"]
     rounds = ["--runs", "1", "--warmup", "0"] if visit.options.driver else ["--runs", "20", "--warmup", "3"]
-    out = visit.step(name, [VLA, "bench", *what, *rounds, "--json", *options], limit, tell=lambda out: f"network {last_json(out)['stages']['network']['p50_ms']:.2f} ms")
+    out = visit.step(name, [VLA, "bench", *what, *rounds, "--json", *options], limit, **environment, tell=lambda out: f"network {last_json(out)['stages']['network']['p50_ms']:.2f} ms")
     if out is None:
         return None
     with open(visit.out / "bench.jsonl", "a", encoding="utf-8") as file:
@@ -235,6 +237,14 @@ def families(visit):
         for traced in map(json.loads, (out or "").splitlines()):
             visit.result["families"][traced.pop("family")]["traced"] = traced
     visit.save()
+
+
+def ways(visit):
+    for family in visit.families:
+        found = visit.result["families"].setdefault(family, {}).setdefault("without", {})
+        for way in WAYS:
+            found[way] = bench(visit, f"{family}, without {way}", family, ["--device", "cuda"], 150, VLA_CUDA_WITHOUT=way)
+            visit.save()
 
 
 def torch(visit):
@@ -297,7 +307,7 @@ def diagnose(visit):
         visit.step("an act, each error of the driver", ["compute-sanitizer", "--report-api-errors", "all", "--print-limit", "5", *command], 180)
 
 
-STAGES = {stage.__name__: stage for stage in (devices, act, kernels, sanitizer, cases, families, torch, products, cpu)}
+STAGES = {stage.__name__: stage for stage in (devices, act, kernels, sanitizer, cases, families, ways, torch, products, cpu)}
 
 
 def main():

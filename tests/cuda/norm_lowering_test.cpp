@@ -72,6 +72,30 @@ TEST_CASE("a product begins the RMS norm that only bf16 products read, and those
       1, 1);
 }
 
+TEST_CASE("ways to lower a graph that VLA_CUDA_WITHOUT names are not used, and the device says so") {
+  const auto build = [](GraphRunner& r, const LowerParams& p) {
+    const Tensor x = add(r.graph, first_product(r, p), input(r, {24, kRows, 1, 1}));
+    return two_products(r, p, normed(r, p, x));
+  };
+  const LowerParams params(DType::bf16);
+  for (const auto& [without, name] : {std::pair{"", ""},
+                                      {"clusters", ", without clusters"},
+                                      {"rotations,halved-norms", ", without halved-norms, rotations"}}) {
+    REQUIRE(setenv("VLA_CUDA_WITHOUT", without, 1) == 0);
+    const bool is_halved = std::string(name).find("halved") == std::string::npos;
+    check(build, is_halved ? 1 : 0, is_halved ? 0 : 1);
+    CHECK(GraphRunner(params.list(), "").device().name() == "cuda:0, a GPU of tests" + std::string(name));
+  }
+  REQUIRE(setenv("VLA_CUDA_WITHOUT", "clusters,rotation", 1) == 0);
+  const auto opened = open_device(1, "");
+  REQUIRE(unsetenv("VLA_CUDA_WITHOUT") == 0);
+  REQUIRE(!opened.ok());
+  CHECK(
+      opened.error().message() ==
+      "VLA_CUDA_WITHOUT: expected names of clusters, adders, halved-norms, rotations, with commas between them, found "
+      "rotation");
+}
+
 TEST_CASE("a norm that a product's kernels cannot begin, or its readers not end, is an operation") {
   for (const Norm& norm : {Norm{op::NormKind::layer}, Norm{op::NormKind::rms, true}})
     check([=](GraphRunner& r,

@@ -42,7 +42,7 @@ def try_gpu(kit, out, *arguments, **environment):
 
 
 def test_the_kit_tells_that_kernels_run_and_are_right_and_what_they_take(kit, tmp_path):
-    stages = ("devices", "act", "kernels", "sanitizer", "cases", "families", "products")
+    stages = ("devices", "act", "kernels", "sanitizer", "cases", "families", "ways", "products")
     done, found = try_gpu(kit, tmp_path, *stages, "--families", "smolvla", "--model", "h100", PATH="/usr/bin:/bin")
     assert done.returncode == 0, done.stdout + done.stderr
     assert found["card"] == "a GPU of tests" and found["driver"].startswith("driver for CUDA")
@@ -52,6 +52,7 @@ def test_the_kit_tells_that_kernels_run_and_are_right_and_what_they_take(kit, tm
     assert found["cases"] == {"passed": 2, "failed": []}
     family = found["families"]["smolvla"]
     assert family["stored"]["ms"]["network"] > 0 and family["int8"]["ms"]["network"] > 0
+    assert all(family["without"][way]["ms"]["network"] > 0 for way in ("clusters", "halved-norms"))
     assert family["predicted"]["model"] == "h100" and family["predicted"]["ms"]["steps"] > 0
     assert {row["kind"] for row in found["products"]} == {"bf16", "ternary", "int4", "int8"}
     assert {row["kernel"] for row in found["attention"]} >= {"attention_bf16_64", "attention_f32"}

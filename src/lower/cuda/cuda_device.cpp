@@ -3,6 +3,7 @@
 #include "lower/cuda/cuda_device.h"
 
 #include <algorithm>
+#include <cstdlib>
 #include <limits>
 
 #include "lower/cuda/cuda_program.h"
@@ -26,15 +27,18 @@ Multiplier multiplier_of(const CudaWeight& weight) {
 
 Result<std::unique_ptr<Device>> CudaDevice::open(const cuda::Driver& driver, int index,
                                                  const std::vector<std::string>& modules, Rounding at_load) {
+  VLA_TRY(const CudaWays ways, cuda_ways(std::getenv("VLA_CUDA_WITHOUT")));
   VLA_TRY(std::shared_ptr<CudaQueue> queue, CudaQueue::open(driver, index, modules));
   const std::string name = "cuda:" + std::to_string(index) + ", " + queue->gpu()->name();
-  return std::unique_ptr<Device>(new CudaDevice(name, std::move(queue), at_load));
+  return std::unique_ptr<Device>(new CudaDevice(name, std::move(queue), ways, at_load));
 }
 
 Result<std::unique_ptr<Device>> CudaDevice::model(const std::string& name, Rounding at_load) {
+  VLA_TRY(const CudaWays ways, cuda_ways(std::getenv("VLA_CUDA_WITHOUT")));
   VLA_TRY(const GpuModel found, find_gpu_model(name));
   std::unique_ptr<CudaDevice> device(new CudaDevice(std::string("model of ") + found.description,
-                                                    std::make_shared<CudaQueue>(found.n_sm, found.is_hopper), at_load));
+                                                    std::make_shared<CudaQueue>(found.n_sm, found.is_hopper), ways,
+                                                    at_load));
   device->model_ = found;
   return std::unique_ptr<Device>(std::move(device));
 }
@@ -107,7 +111,7 @@ Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const Low
                          .alignment = kDeviceAlignment,
                          .groups = weights_.groups()};
   CudaLowering l = {
-      {.graph = graph, .options = options, .target = target}, weights_, queue_->n_sm(), queue_->is_hopper()};
+      {.graph = graph, .options = options, .target = target}, weights_, queue_->n_sm(), queue_->is_hopper(), ways_};
   start(l);
   std::vector<FusedOp> ops = fuse(l);
   store(l, ops);

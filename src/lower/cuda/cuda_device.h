@@ -4,6 +4,7 @@
 
 #include "graph/device.h"
 #include "lower/cuda/cuda_queue.h"
+#include "lower/cuda/cuda_ways.h"
 #include "lower/cuda/cuda_weights.h"
 #include "lower/cuda/gpu_model.h"
 
@@ -12,7 +13,8 @@ namespace vla::lower {
 /// A GPU that runs our own kernels (cuda/kernels). An act is one captured graph.
 class CudaDevice final : public Device {
  public:
-  /// modules: the kernels' PTX. at_load: see CudaWeights::load. Errors: device.
+  /// modules: the kernels' PTX. at_load: see CudaWeights::load. `VLA_CUDA_WITHOUT` names ways that are not used (see
+  /// cuda_ways). Errors: device, usage.
   static Result<std::unique_ptr<Device>> open(const cuda::Driver& driver, int index,
                                               const std::vector<std::string>& modules, Rounding at_load);
   /// Models a GPU that is not present (DeviceLibrary::model). Errors: usage for an unknown name.
@@ -41,14 +43,15 @@ class CudaDevice final : public Device {
   std::size_t working_size() const override { return arena_ ? arena_->size() : 0; }
 
  private:
-  CudaDevice(std::string name, std::shared_ptr<CudaQueue> queue, Rounding at_load)
-      : name_(std::move(name)), queue_(std::move(queue)), rounding_(at_load) {}
+  CudaDevice(const std::string& name, std::shared_ptr<CudaQueue> queue, const CudaWays& ways, Rounding at_load)
+      : name_(name + text_of(ways)), queue_(std::move(queue)), ways_(ways), rounding_(at_load) {}
 
   std::string name_;
   std::optional<GpuModel> model_;
   std::shared_ptr<CudaQueue> queue_;  // destroyed after all device memory
   CudaWeights weights_;
   std::shared_ptr<cuda::Buffer> arena_;
+  CudaWays ways_;
   Rounding rounding_;
   std::int64_t min_rounded_keys_ = 0;
 };

@@ -9,6 +9,7 @@
 #include "cuda/kernels/linear_bf16.h"
 #include "kernels/sizes.h"
 #include "lower/cuda/cuda_queue.h"
+#include "lower/cuda/cuda_ways.h"
 #include "lower/cuda/cuda_weights.h"
 #include "lower/ops.h"
 
@@ -73,6 +74,7 @@ struct CudaLowering : Lowering {
   const CudaWeights& weights;
   int n_sm;  // SMs of the device
   bool is_hopper;
+  CudaWays ways = {};
   std::vector<CudaOp> ops = {};
   std::vector<cuda::Address> data = {};  // address of each base, once memory is allocated
 
@@ -114,7 +116,7 @@ unsigned common_width(std::int64_t n_row, std::int64_t n_column, std::int64_t de
 enum class HopperCutFor { one, gated, several, begins_norm };
 /// The Hopper tile with the shortest estimated time. n_column: columns of all products together.
 ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
-                          HopperCutFor what, int n_sm);
+                          HopperCutFor what, int n_sm, const CudaWays& ways);
 /// Chooses the fastest cut. is_gated: one kernel computes gate and up, which have n_column columns together.
 ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_row, std::int64_t n_column,
                        std::int64_t depth, bool is_gated);

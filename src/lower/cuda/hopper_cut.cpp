@@ -89,7 +89,7 @@ std::vector<Candidate> candidates(MatrixKind kind, HopperCutFor what) {
 }  // namespace
 
 ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth,
-                          HopperCutFor what, int n_sm) {
+                          HopperCutFor what, int n_sm, const CudaWays& ways) {
   const bool is_bf16 = kind == MatrixKind::bf16;
   const std::int64_t n_step = ceil_div(depth, is_bf16 ? cuda::kHopperDepth : cuda::kHopperInt8Depth);
   const ProductRates& rates = is_bf16 ? kBf16 : kind == MatrixKind::int8 ? kInt8 : kTernary;
@@ -101,7 +101,9 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
       const std::int64_t n_whole = ceil_div(n_row, tile.rows) * ceil_div(n_column, tile.columns);
       if (n_split > 1 && n_step / n_split < (is_bf16 || n_split > 4 ? 4 : 1)) break;
       if (!is_bf16 && n_whole * (n_split - 1) > 2 * n_sm) break;
-      if (what == HopperCutFor::begins_norm && n_split > 1 && !in_cluster) continue;
+      const bool has_adder = n_split > 1 && !in_cluster;
+      if (has_adder && (what == HopperCutFor::begins_norm || (!ways.adders && n_row <= 64))) continue;
+      if (in_cluster && !ways.clusters) continue;
       const auto size = static_cast<double>(tile.columns * tile.rows);
       const std::int64_t n_of_y = what == HopperCutFor::gated ? tile.columns / 2 : tile.columns;
       const auto n_used = static_cast<double>(std::min(tile.rows, n_row));
@@ -118,7 +120,7 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
       const int n_usable = in_cluster ? usable_sms(n_sm, n_split) : n_sm;
       const auto n_wave = static_cast<double>(ceil_div(n_whole * n_split, n_usable));
       double us = rates.kernel + of_block * (1 + rates.further * (n_wave - 1));
-      if (n_split > 1 && !in_cluster) us += static_cast<double>(4 * n_row * n_column * (n_split + 1)) / kWritten;
+      if (has_adder) us += static_cast<double>(4 * n_row * n_column * (n_split + 1)) / kWritten;
       if (us < best.us) best.n_split = n_split, best.tile = tile.index, best.in_cluster = in_cluster, best.us = us;
     }
   return best;

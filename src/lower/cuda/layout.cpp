@@ -29,7 +29,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     for (CudaOp& op : l.ops)
       if (auto* head = std::get_if<HeadOp>(&op.op)) rotate_at_once(op, head->rows);
     std::erase_if(l.ops, [](const CudaOp& op) { return op.writes.empty(); });
-    halve_norms(l);
+    if (l.ways.halved_norms) halve_norms(l);
     for (CudaOp& op : l.ops)
       if (const auto* product = std::get_if<LinearOp>(&op.op); product != nullptr && !op.cut.in_cluster)
         split(op, op.cut.n_split, n_sum(op, *product));
@@ -112,7 +112,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     const Shape& y = product.linears[0]->shape;
     const std::int64_t n_row = rows_of(y), depth = l.value(product.x).shape[0];
     ProductCut cut = cut_product(l, MatrixKind::bf16, n_row, n_column, depth, false);
-    if (cut.tile) cut = cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::several, l.n_sm);
+    if (cut.tile) cut = cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::several, l.n_sm, l.ways);
     const bool is_one_launch = cut.tile || (strip_width(cut.shape) > 0 && cut.n_split == 1);
     if (!is_one_launch || cut.us >= apart) return;
     for (const std::size_t i : all) {
@@ -169,7 +169,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
   /// by one kernel.
   void rotate_at_once(CudaOp& head, const HeadRows& rows) {
     const Shape x = l.value(rows.x).shape;
-    if (rows.norm != nullptr || rows.rope == nullptr || x[0] % 8 != 0) return;
+    if (!l.ways.rotations || rows.norm != nullptr || rows.rope == nullptr || x[0] % 8 != 0) return;
     CudaOp* const maker = maker_of_heads(rows);
     if (maker == nullptr || !rotates(*maker)) return;
     const CudaOp* const of_table = maker_of(l, l.value(rows.table).base);

@@ -70,10 +70,10 @@ ProductCut cut_product(const CudaLowering& l, MatrixKind kind, std::int64_t n_ro
     // Measured: tiles of few rows, with the kernel that adds their shares, take this many microseconds more than
     // estimated.
     constexpr double kMore = 1.5;
-    const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
+    const ProductCut tiles = cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm, l.ways);
     return tiles.us + kMore < strips.us ? tiles : strips;
   }
-  if (has_tiles) return cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm);
+  if (has_tiles) return cut_for_hopper(kind, n_row, n_column, depth, tables, n_sm, l.ways);
   const std::int64_t n_large = blocks_of(n_row, n_column, 128, 128);
   using enum cuda::Bf16Shape;
   const cuda::Bf16Shape shape = is_few ? few : n_row > 64 && n_large >= n_sm ? rows128 : rows64;
@@ -92,7 +92,8 @@ ProductCut cut_to_begin_norm(const CudaLowering& l, std::int64_t n_row, std::int
   ProductCut best = {.us = kNever};
   if (is_of_strips(n_row, depth)) best = cut_in_strips(n_row, n_column, depth, l.n_sm, true);
   if (!l.is_hopper) return best;
-  const ProductCut tile = cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::begins_norm, l.n_sm);
+  const ProductCut tile =
+      cut_for_hopper(MatrixKind::bf16, n_row, n_column, depth, HopperCutFor::begins_norm, l.n_sm, l.ways);
   return tile.us < best.us ? tile : best;
 }
 
