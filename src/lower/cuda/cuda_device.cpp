@@ -110,8 +110,7 @@ Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const Low
                          .keeps_taps = true,
                          .alignment = kDeviceAlignment,
                          .groups = weights_.groups()};
-  CudaLowering l = {
-      {.graph = graph, .options = options, .target = target}, weights_, queue_->n_sm(), queue_->is_hopper(), ways_};
+  CudaLowering l({.graph = graph, .options = options, .target = target}, weights_, *queue_, ways_);
   start(l);
   std::vector<FusedOp> ops = fuse(l);
   store(l, ops);

@@ -71,10 +71,13 @@ struct CudaOp : Step {
 inline bool leaves_shares(const CudaOp& op) { return op.partial != kNone && op.writes[0] == op.partial; }
 
 struct CudaLowering : Lowering {
+  CudaLowering(Lowering of, const CudaWeights& loaded, const CudaQueue& queue, const CudaWays& used)
+      : Lowering(std::move(of)), weights(loaded), n_sm(queue.n_sm()), is_hopper(queue.is_hopper()), ways(used) {}
+
   const CudaWeights& weights;
   int n_sm;  // SMs of the device
   bool is_hopper;
-  CudaWays ways = {};
+  CudaWays ways;
   std::vector<CudaOp> ops = {};
   std::vector<cuda::Address> data = {};  // address of each base, once memory is allocated
 
