@@ -99,6 +99,7 @@ VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
                  ", adds" tail ";\n}"                                                                  \
                  : VLA_S##half(c) : "l"(a), "l"(b), "r"(static_cast<int>(adds)) : "memory")
 #define VLA_WGMMA_OF_ANY_SIZE(shape, tail, c)          \
+  VLA_WGMMA(48, 24, 25, 26, shape, tail, c);           \
   VLA_WGMMA(64, 32, 33, 34, shape, tail, c);           \
   VLA_WGMMA(80, 40, 41, 42, shape, tail, c);           \
   VLA_WGMMA(96, 48, 49, 50, shape, tail, c);           \
@@ -119,14 +120,14 @@ VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
 /// row l / 4 + 8 h of these, column 8 j + 2 (l % 4) + c.
 template <int kN>
 VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
-  static_assert(kN % 16 == 0 && kN >= 64 && kN <= 256);
+  static_assert(kN % 16 == 0 && kN >= 48 && kN <= 256);
   VLA_WGMMA_OF_ANY_SIZE("k16.f32.bf16.bf16", ", 1, 1, 0, 0", "+f");
 }
 
 /// sum[64, kN] (+)= a[64, 32] * b[kN, 32]^T of signed bytes, exactly, else as wgmma_bf16.
 template <int kN>
 VLA_DEVICE void wgmma_s8(int (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
-  static_assert(kN % 16 == 0 && kN >= 64 && kN <= 256);
+  static_assert(kN % 16 == 0 && kN >= 48 && kN <= 256);
   VLA_WGMMA_OF_ANY_SIZE("k32.s32.s8.s8", "", "+r");
 }
 

@@ -133,16 +133,17 @@ inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
 
 /// Tiles of the kernels for Hopper only (hopper_linear_bf16.cu): columns, a multiple of 64, and rows, a multiple of 16.
 /// These have a second kernel, for several products in one launch:
-#define VLA_HOPPER_SEVERAL_TILES(each) \
-  each(64, 64) each(128, 64) each(128, 96) each(128, 112) each(128, 128) each(128, 192) each(192, 112) each(192, 192)
-#define VLA_HOPPER_OTHER_TILES(each)                                                                      \
-  each(64, 128) each(128, 144) each(128, 160) each(128, 176) each(128, 224) each(128, 256) each(192, 160) \
-      each(192, 224) each(256, 112) each(256, 128) each(256, 160)
+#define VLA_HOPPER_SEVERAL_TILES(each)                                                                               \
+  each(64, 64) each(128, 48) each(128, 64) each(128, 96) each(128, 112) each(128, 128) each(128, 192) each(192, 112) \
+      each(192, 192)
+#define VLA_HOPPER_OTHER_TILES(each)                                                                     \
+  each(192, 48) each(64, 128) each(128, 144) each(128, 160) each(128, 176) each(128, 224) each(128, 256) \
+      each(192, 160) each(192, 224) each(256, 112) each(256, 128) each(256, 160)
 #define VLA_HOPPER_TILES(each) VLA_HOPPER_SEVERAL_TILES(each) VLA_HOPPER_OTHER_TILES(each)
 /// The same for gated products. Half of a tile's columns belong to the gate's matrix, half to the other.
-#define VLA_HOPPER_GATED_TILES(each)                                                                      \
-  each(128, 96) each(128, 128) each(128, 160) each(128, 192) each(128, 224) each(128, 256) each(256, 112) \
-      each(256, 128) each(256, 160)
+#define VLA_HOPPER_GATED_TILES(each)                                                                     \
+  each(128, 64) each(128, 96) each(128, 128) each(128, 160) each(128, 192) each(128, 224) each(128, 256) \
+      each(256, 112) each(256, 128) each(256, 160)
 struct HopperTile {
   const char* kernel;
   int columns, rows;
