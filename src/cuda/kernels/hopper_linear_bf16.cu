@@ -56,6 +56,7 @@ VLA_DEVICE void multiply(const LinearBf16Job& job, int block) {
   const std::uint64_t x0 = swizzled_descriptor(shared + T::kBytesW);
   int stage = 0, next = T::kStages - 2;
   int i = 0;
+#pragma unroll 1
   do {
     dev::wait_copies<T::kStages - 3>();
     dev::fence_async_proxy();
