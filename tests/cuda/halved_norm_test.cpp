@@ -1,5 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
 #include <functional>
 
 #include "cuda/kernels/linear_bf16.h"
@@ -14,12 +15,13 @@ using namespace vla::test::cuda;
 
 namespace {
 
-/// A kernel that begins norms: a strip's width, or 0 for Hopper's tile.
+/// A kernel that begins norms: a strip's width, or 0 for a tile of Hopper.
 struct Beginner {
   unsigned width;
   int n_split;
+  std::size_t tile = 0;  // index into kHopperTiles
 };
-constexpr Beginner kBeginners[] = {{16, 1}, {32, 1}, {64, 1}, {0, 1}, {0, 3}, {0, 8}};
+constexpr Beginner kBeginners[] = {{16, 1}, {32, 1}, {64, 1}, {0, 1}, {0, 3}, {0, 8}, {0, 1, 1}, {0, 4, 1}, {0, 2, 2}};
 
 // Rows and columns that a block has, fewer, and more; columns that four at a time divide, and do not.
 constexpr ProductCase kBegun[] = {
@@ -29,61 +31,81 @@ constexpr ProductCase kBegun[] = {
     {9, 520, 20, 1, Activation::none, true},
 };
 
-/// Checks that a product leaves y, y * weight in bf16, and the sums of y * y of each part of a row.
-void check_begun(const ProductCase& c, const Beginner& kernel, bool has_weight) {
+struct BegunNorm {
+  bool is_layer, has_weight, has_bias;
+};
+
+/// Checks that a product leaves y, y * weight in bf16 with the norm's weight and bias after the last row, and the
+/// moments of each part of a row.
+void check_begun(const ProductCase& c, const Beginner& kernel, const BegunNorm& norm) {
   const Operands of(c, true);
   const std::int64_t stride = round_up(c.depth, 8), of_rows = round_up(c.n_column, 2) + 2;
   const int part = kernel.width == 0 ? 64 : norm_part(kernel.width), n_part = (c.n_column + part - 1) / part;
+  const int n_more = (norm.is_layer ? 1 : 0) + (norm.has_bias ? 1 : 0);
   Numbers numbers;
-  const std::vector<float> weight = numbers.floats(c.n_column);
-  const Device<std::uint16_t> rows(std::vector<std::uint16_t>(static_cast<std::size_t>(c.n_row * of_rows), 0xffff));
-  const Device<float> norm_weight(weight), squares(static_cast<std::size_t>(n_part * c.n_row));
+  const std::vector<float> weight = numbers.floats(c.n_column), bias = numbers.floats(c.n_column);
+  const Device<std::uint16_t> rows(
+      std::vector<std::uint16_t>(static_cast<std::size_t>((c.n_row + n_more) * of_rows), 0xffff));
+  const Device<float> norm_weight(weight), norm_bias(bias), squares(static_cast<std::size_t>(n_part * c.n_row)),
+      sums(static_cast<std::size_t>(n_part * c.n_row));
   const std::vector<float> y = run_product(of, [&](const Epilogue& end) {
     const Device<std::uint16_t> x(bf16_rows(of.x, c.depth, stride)), matrix(bf16_rows(of.weight, c.depth, stride));
-    const LinearBf16Job job = {
-        .x = x.get(),
-        .weight = matrix.get(),
-        .x_stride = stride,
-        .weight_stride = stride,
-        .n_row = c.n_row,
-        .n_column = c.n_column,
-        .depth = c.depth,
-        .n_split = kernel.n_split,
-        .partial = nullptr,
-        .end = end,
-        .norm_begin = {rows.get(), of_rows, has_weight ? norm_weight.get() : nullptr, squares.get()}};
-    launch(kernel.width == 0 ? hopper_linear_bf16(kHopperTiles[kHopperBegins], job) : linear_strip(kernel.width, job),
+    LinearBf16Job job = {.x = x.get(), .weight = matrix.get(), .x_stride = stride, .weight_stride = stride};
+    job.n_row = c.n_row, job.n_column = c.n_column, job.depth = c.depth, job.n_split = kernel.n_split, job.end = end;
+    job.norm_begin = {.rows = rows.get(),
+                      .stride = of_rows,
+                      .weight = norm.has_weight ? norm_weight.get() : nullptr,
+                      .bias = norm.has_bias ? norm_bias.get() : nullptr,
+                      .moments = {squares.get(), norm.is_layer ? sums.get() : nullptr, n_part, part}};
+    launch(kernel.width == 0 ? hopper_linear_bf16(kHopperTiles[kernel.tile], job) : linear_strip(kernel.width, job),
            job);
   });
   CHECK(error(y, of.expected()) < 1e-6 + bf16_sum_error(c.depth));
-  const std::vector<float> begun = widened(rows.host()), sums = squares.host();
-  std::vector<double> expected(sums.size());
+  const std::vector<float> begun = widened(rows.host());
+  // An element of the rows and of those after the last.
+  const auto expected_row = [&](int row, std::size_t i) {
+    const float scale = norm.has_weight ? weight[i] : 1;
+    if (row < c.n_row) return y[static_cast<std::size_t>(row * c.n_column) + i] * scale;
+    return norm.is_layer && row == c.n_row ? scale : bias[i];
+  };
   bool are_rounded = true;
-  for (int row = 0; row < c.n_row; ++row)
+  for (int row = 0; row < c.n_row + n_more; ++row)
     for (int i = 0; i < of_rows; ++i) {
-      const auto column = static_cast<std::size_t>(i);
       const float found = begun[static_cast<std::size_t>(row * of_rows + i)];
-      if (i >= c.n_column) {
-        are_rounded = are_rounded && std::isnan(found);  // nothing is written behind a row
-        continue;
-      }
-      const float value = y[static_cast<std::size_t>(row * c.n_column + i)];
-      are_rounded = are_rounded && found == from_bf16(to_bf16(has_weight ? value * weight[column] : value));
-      expected[static_cast<std::size_t>(i / part * c.n_row + row)] += static_cast<double>(value) * value;
+      const bool is_there = i < c.n_column;  // nothing is written behind a row
+      are_rounded =
+          are_rounded &&
+          (is_there ? found == from_bf16(to_bf16(expected_row(row, static_cast<std::size_t>(i)))) : std::isnan(found));
     }
   CHECK(are_rounded);
-  CHECK(error(sums, expected) < 1e-6);
+  std::vector<double> expected_sums, expected_squares;
+  for (int p = 0; p < n_part; ++p)
+    for (int row = 0; row < c.n_row; ++row) {
+      const int end = std::min((p + 1) * part, c.n_column);
+      double sum = 0, off = 0;
+      const auto value = [&](int i) { return static_cast<double>(y[static_cast<std::size_t>(row * c.n_column + i)]); };
+      for (int i = p * part; i < end; ++i) sum += value(i);
+      const double mean = norm.is_layer ? sum / (end - p * part) : 0;
+      for (int i = p * part; i < end; ++i) off += (value(i) - mean) * (value(i) - mean);
+      expected_sums.push_back(sum), expected_squares.push_back(off);
+    }
+  CHECK(error(squares.host(), expected_squares) < 1e-6);
+  if (norm.is_layer) CHECK(error(sums.host(), expected_sums) < 1e-6);
 }
 
 }  // namespace
 
-TEST_CASE("products begin norms: they leave y, y times a weight in bf16, and sums of squares") {
+TEST_CASE("products begin norms: they leave y, y times a weight in bf16, and moments of rows") {
   counts = {};
   for (const ProductCase& c : kBegun)
     for (const Beginner& kernel : kBeginners) {
       if (kernel.width == 0 && !is_hopper()) continue;
-      INFO("width ", kernel.width, ", ", kernel.n_split, " shares, ", c.n_row, " x ", c.n_column);
-      in_every_schedule([&] { check_begun(c, kernel, c.n_column != 20); });
+      INFO("width ", kernel.width, ", tile ", kernel.tile, ", ", kernel.n_split, " shares, ", c.n_row, " x ",
+           c.n_column);
+      for (const BegunNorm& norm : {BegunNorm{false, c.n_column != 20, false}, BegunNorm{true, c.n_column != 20, true}})
+        in_two_schedules(static_cast<std::size_t>(&kernel - kBeginners), [&] { check_begun(c, kernel, norm); });
+      check_begun(c, kernel, {true, true, false});
+      check_begun(c, kernel, {false, false, true});
     }
   CHECK(counts.bank_conflicts == 0);
 }
@@ -132,11 +154,79 @@ void check_ended(const EndedCase& c) {
   const std::vector<float> expected = run(by_hand.get(), {});
   static std::size_t number = 0;
   in_two_schedules(number++, [&] {
-    const std::vector<float> found = run(as_they_are.get(), {sums.get(), kParts, kEps});
+    const std::vector<float> found = run(as_they_are.get(), {{sums.get(), nullptr, kParts, 64}, kEps});
     CHECK(found == expected);
     CHECK(!std::isnan(found.back()));
   });
 }
+
+/// Checks a product that ends layer norms, and RMS norms with a bias, against doubles.
+void check_shifted(const EndedCase& c) {
+  constexpr int kRows = 41, kColumns = 96, kDepth = 520, kPart = 64, kParts = (kDepth + kPart - 1) / kPart, kHead = 32;
+  constexpr float kEps = 0.25f;
+  Numbers numbers;
+  const std::vector<float> x = rounded_to_bf16(numbers.floats((kRows + 2) * kDepth));  // and a weight's and a bias' row
+  const std::vector<float> squares = numbers.floats(kParts * kRows), sums = numbers.floats(kParts * kRows, 9);
+  std::vector<float> positive = squares;
+  for (float& one : positive) one = 30 * std::fabs(one) + 1;
+  const std::vector<float> weight = rounded_to_bf16(numbers.floats(kColumns * kDepth, 0.04f)),
+                           gate = rounded_to_bf16(numbers.floats(kColumns * kDepth, 0.04f)),
+                           bias = numbers.floats(kColumns), table = numbers.floats(kHead * kRows);
+  const Device<std::uint16_t> rows(bf16_rows(x, kDepth, kDepth)), of_y(bf16_rows(weight, kDepth, kDepth)),
+      of_gate(bf16_rows(gate, kDepth, kDepth));
+  const Device<float> all_squares(positive), all_sums(sums), all_bias(bias), turns(table),
+      partial(static_cast<std::size_t>(2 * c.n_split * (kRows + 2) * kColumns));
+  const auto product = [&](const std::vector<float>& matrix, int row, int column) {
+    double sum = 0;
+    for (int k = 0; k < kDepth; ++k)
+      sum += static_cast<double>(x[static_cast<std::size_t>(row * kDepth + k)]) *
+             static_cast<double>(matrix[static_cast<std::size_t>(column * kDepth + k)]);
+    return sum;
+  };
+  for (const bool is_layer : {true, false}) {
+    const auto normed = [&](const std::vector<float>& matrix, int row, int column) {
+      double mean = 0, all = 0;
+      const auto at = [&](int part) { return static_cast<std::size_t>(part * kRows + row); };
+      for (int part = 0; part < kParts && is_layer; ++part) mean += static_cast<double>(sums[at(part)]) / kDepth;
+      for (int part = 0; part < kParts; ++part) {
+        const int n = std::min(kPart, kDepth - part * kPart);
+        const double off = is_layer ? static_cast<double>(sums[at(part)]) / n - mean : 0;
+        all += static_cast<double>(positive[at(part)]) + n * off * off;
+      }
+      const double factor = 1 / std::sqrt(all / kDepth + static_cast<double>(kEps));
+      return factor * (product(matrix, row, column) - mean * product(matrix, kRows, column)) +
+             product(matrix, is_layer ? kRows + 1 : kRows, column) +
+             static_cast<double>(bias[static_cast<std::size_t>(column)]);
+    };
+    std::vector<double> expected;
+    for (int row = 0; row < kRows; ++row)
+      for (int column = 0; column < kColumns; ++column) {
+        double y = normed(weight, row, column);
+        if (c.is_gated) y *= activated(Activation::silu, normed(gate, row, column));
+        if (c.is_rotated) {
+          const int half = kHead / 2, i = column % half;
+          const bool is_first = column % kHead < half;
+          const double other = is_first ? -normed(weight, row, column + half) : normed(weight, row, column - half);
+          y = y * static_cast<double>(table[static_cast<std::size_t>(row * kHead + i)]) +
+              other * static_cast<double>(table[static_cast<std::size_t>(row * kHead + half + i)]);
+        }
+        expected.push_back(y);
+      }
+    INFO(c.name, ", ", c.n_split, " shares, layer norm: ", is_layer);
+    const Device<float> y(static_cast<std::size_t>(kRows * kColumns));
+    LinearBf16Job job = {.x = rows.get(), .weight = of_y.get(), .x_stride = kDepth, .weight_stride = kDepth};
+    job.n_row = kRows, job.n_column = kColumns, job.depth = kDepth, job.n_split = c.n_split;
+    job.partial = c.has_partial ? partial.get() : nullptr;
+    job.end.bias = all_bias.get(), job.end.y = y.get(), job.end.y_stride = kColumns;
+    if (c.is_gated)
+      job.gate_weight = of_gate.get(), job.gate_bias = all_bias.get(), job.end.activation = Activation::silu;
+    if (c.is_rotated) job.rotation = {turns.get(), kHead, kRows};
+    job.norm_end = {{all_squares.get(), is_layer ? all_sums.get() : nullptr, kParts, kPart}, kEps, true};
+    c.run(job);
+    CHECK(error(y.host(), expected) < 4e-6 + 4 * bf16_sum_error(kDepth));
+  }
+}
+void check_both(const EndedCase& c) { check_ended(c), check_shifted(c); }
 
 /// Runs three products in one launch, `launch_of` them; `job` is the last, the others have results of their own.
 template <class LaunchOf>
@@ -151,7 +241,7 @@ void run_several(const LinearBf16Job& job, LaunchOf launch_of) {
 
 }  // namespace
 
-TEST_CASE("strips end norms, to the bit") {
+TEST_CASE("strips end norms, RMS norms to the bit") {
   for (const unsigned width : {16U, 32U, 64U, 128U})
     for (const bool are_several : {false, true}) {
       if (width == 128 && are_several) continue;
@@ -159,13 +249,13 @@ TEST_CASE("strips end norms, to the bit") {
         if (!are_several) return launch(linear_strip(width, job), job);
         run_several(job, [=](Several<LinearBf16Job>& jobs) { return linear_strips(width, jobs); });
       };
-      check_ended({.name = "strips", .run = run});
-      if (width < 128) check_ended({.name = "rotated strips", .is_rotated = true, .run = run});
-      if (!are_several) check_ended({.name = "gated strips", .is_gated = true, .run = run});
+      check_both({.name = "strips", .run = run});
+      if (width < 128) check_both({.name = "rotated strips", .is_rotated = true, .run = run});
+      if (!are_several) check_both({.name = "gated strips", .is_gated = true, .run = run});
     }
 }
 
-TEST_CASE("kernels that add shares end norms, to the bit") {
+TEST_CASE("kernels that add shares end norms, RMS norms to the bit") {
   const auto run = [](Bf16Shape shape, bool are_several) {
     return [=](const LinearBf16Job& job) {
       launch(linear_bf16(shape, job), job);
@@ -174,15 +264,16 @@ TEST_CASE("kernels that add shares end norms, to the bit") {
     };
   };
   for (const bool are_several : {false, true})
-    for (const Bf16Shape shape : {Bf16Shape::strip16, Bf16Shape::rows64, Bf16Shape::rows128}) {
-      check_ended({"shares", 3, true, false, false, run(shape, are_several)});
-      check_ended({"shares of rotated heads", 3, true, false, true, run(shape, are_several)});
-    }
-  check_ended({"shares of gated products", 3, true, true, false, run(Bf16Shape::strip32, false)});
+    for (const Bf16Shape shape : {Bf16Shape::strip16, Bf16Shape::rows64, Bf16Shape::rows128})
+      for (const bool is_rotated : {false, true}) {
+        const EndedCase one = {"shares", 3, true, false, is_rotated, run(shape, are_several)};
+        shape == Bf16Shape::strip16 ? check_both(one) : check_ended(one);
+      }
+  check_both({"shares of gated products", 3, true, true, false, run(Bf16Shape::strip32, false)});
   check_ended({"more shares than are added at once", 9, true, false, false, run(Bf16Shape::rows64, false)});
 }
 
-TEST_CASE("tiles for Hopper end norms, to the bit") {
+TEST_CASE("tiles for Hopper end norms, RMS norms to the bit") {
   if (!is_hopper()) {
     MESSAGE("skipped: no device of compute capability 9.0");
     return;
@@ -194,11 +285,11 @@ TEST_CASE("tiles for Hopper end norms, to the bit") {
         launch(hopper_linear_bf16(tile, job), job);
         if (job.partial != nullptr) launch(finish_bf16_partial(job), job);
       };
-      check_ended({tile.kernel, n_split, n_split > 1 && !in_cluster, tile.is_gated, false, run});
+      check_both({tile.kernel, n_split, n_split > 1 && !in_cluster, tile.is_gated, false, run});
       if (tile.several == nullptr || n_split > 1) continue;
-      check_ended({.name = tile.several, .run = [&](const LinearBf16Job& job) {
-                     run_several(job, [&](Several<LinearBf16Job>& jobs) { return hopper_linears_bf16(tile, jobs); });
-                   }});
+      check_both({.name = tile.several, .run = [&](const LinearBf16Job& job) {
+                    run_several(job, [&](Several<LinearBf16Job>& jobs) { return hopper_linears_bf16(tile, jobs); });
+                  }});
     }
 }
 
@@ -228,10 +319,11 @@ TEST_CASE("a product that ends a norm gives what the norm and the product would"
   LinearBf16Job begins = {.x = x.get(), .weight = w.get(), .x_stride = kDepth, .weight_stride = kDepth};
   begins.n_row = kRows, begins.n_column = kWidth, begins.depth = kDepth, begins.n_split = 1;
   begins.end.y = sums.get(), begins.end.y_stride = kWidth;
-  begins.norm_begin = {rows.get(), kWidth, of_norm.get(), squares.get()};
+  begins.norm_begin = {rows.get(), kWidth, of_norm.get(), nullptr, {squares.get(), nullptr, kParts, kPart}};
   LinearBf16Job ends = {.x = rows.get(), .weight = next.get(), .x_stride = kWidth, .weight_stride = kWidth};
   ends.n_row = kRows, ends.n_column = kColumns, ends.depth = kWidth, ends.n_split = 1;
-  ends.end.y = result.get(), ends.end.y_stride = kColumns, ends.norm_end = {squares.get(), kParts, kEps};
+  ends.end.y = result.get(), ends.end.y_stride = kColumns,
+  ends.norm_end = {{squares.get(), nullptr, kParts, kPart}, kEps};
   launch(linear_strip(kPart, begins), begins);
   launch(linear_strip(kPart, ends), ends);
   CHECK(error(result.host(), expected) < 6e-3);  // rows are rounded to bf16

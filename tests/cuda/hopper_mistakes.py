@@ -202,8 +202,8 @@ HOPPER_MISTAKES = {
     "the gate's bias is not added": (
         "hopper_tile.h",
         "hopper_linear_bf16",
-        "dev::add(value(of[i], gate_sum[i].of[c], c), gate_bias.of[c])",
-        "value(of[i], gate_sum[i].of[c], c)",
+        "dev::add(value(of[i], gate_sum[i].of[c], c, true), gate_bias.of[c])",
+        "value(of[i], gate_sum[i].of[c], c, true)",
     ),
     "codes are unpacked before they came": (
         "hopper_linear_int8.cu",
@@ -280,14 +280,14 @@ HOPPER_MISTAKES = {
     "factors of a norm lie where sums do": (
         "hopper_linear_bf16.cu",
         "hopper_linear_bf16",
-        "factors = shared + T::kRows * (T::kColumns + 4) * 4;",
-        "factors = shared;",
+        "all_terms = shared + T::kRows * (T::kColumns + 4) * 4;",
+        "all_terms = shared;",
     ),
     "a tile's sums are not multiplied": (
         "hopper_linear_bf16.cu",
         "hopper_linear_bf16",
-        "dev::multiply(of_column, of_row)",
-        "of_column",
+        "all[of_gate ? kHalves - 1 : 0].normed(row, sum, c)",
+        "sum",
     ),
     "a tile stores rows behind the last, whose squares it has": (
         "hopper_tile.h",
@@ -306,5 +306,23 @@ HOPPER_MISTAKES = {
         "hopper_linear_bf16",
         "Then::kTakesRows && row >= end_row_ ? row0_ : row",
         "row",
+    ),
+    "a gate's columns take the other product's bias": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "sums_of(row, half > 0)",
+        "sums_of(row, false)",
+    ),
+    "rows after those of y are not fetched": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "row0, job.n_row_x(), job.depth * 2",
+        "row0, job.n_row, job.depth * 2",
+    ),
+    "a tile leaves shares of rows of y alone": (
+        "hopper_linear_bf16.cu",
+        "hopper_linear_bf16",
+        "job.partial ? job.n_row_x() : job.n_row",
+        "job.n_row",
     ),
 }

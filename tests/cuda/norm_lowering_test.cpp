@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// RMS norms between bf16 products on our own kernels for CUDA, through the fake driver (see lowering_test.cpp).
+// Norms between bf16 products on our own kernels for CUDA, through the fake driver (see lowering_test.cpp).
 #include "lower/lower_case.h"
 
 namespace norm_lowering_test {
@@ -18,8 +18,8 @@ struct Norm {
   bool has_bias = false;
 };
 
-Tensor first_product(GraphRunner& r, const LowerParams& p) {
-  return p.linear(r.graph, input(r, {24, kRows, 1, 1}), 24);
+Tensor first_product(GraphRunner& r, const LowerParams& p, int n_row = kRows) {
+  return p.linear(r.graph, input(r, {24, n_row, 1, 1}), 24);
 }
 Tensor normed(GraphRunner& r, const LowerParams& p, Tensor x, const Norm& norm = {}) {
   std::vector<Tensor> in = {x, p.parameter(r.graph, 24)};
@@ -52,7 +52,17 @@ void check(const Build& build, int n_begun, int n_operation) {
 
 }  // namespace
 
-TEST_CASE("a product begins the RMS norm that only bf16 products read, and those end it") {
+TEST_CASE("a product begins the norm that only bf16 products read, and those end it") {
+  for (const int n_row : {kRows, 62})
+    for (const Norm& norm : {Norm{op::NormKind::layer}, Norm{op::NormKind::layer, true}, Norm{op::NormKind::rms, true}})
+      check([=](GraphRunner& r,
+                const LowerParams& p) { return two_products(r, p, normed(r, p, first_product(r, p, n_row), norm)); },
+            1, 0);
+  check(
+      [](GraphRunner& r, const LowerParams& p) {  // without parameters
+        return two_products(r, p, r.graph.add(op::Norm{op::NormKind::layer, 1e-5f}, {first_product(r, p)}));
+      },
+      1, 0);
   check([](GraphRunner& r, const LowerParams& p) { return two_products(r, p, normed(r, p, first_product(r, p))); }, 1,
         0);
   check(
@@ -97,10 +107,11 @@ TEST_CASE("ways to lower a graph that VLA_CUDA_WITHOUT names are not used, and t
 }
 
 TEST_CASE("a norm that a product's kernels cannot begin, or its readers not end, is an operation") {
-  for (const Norm& norm : {Norm{op::NormKind::layer}, Norm{op::NormKind::rms, true}})
-    check([=](GraphRunner& r,
-              const LowerParams& p) { return two_products(r, p, normed(r, p, first_product(r, p), norm)); },
-          0, 1);
+  check(
+      [](GraphRunner& r, const LowerParams& p) {  // rows, and those of a weight and a bias, of more than a block
+        return two_products(r, p, normed(r, p, first_product(r, p, 63), {op::NormKind::layer, true}));
+      },
+      0, 1);
   check(
       [](GraphRunner& r, const LowerParams& p) {  // of a product with an activation
         return two_products(r, p, normed(r, p, activate(r.graph, first_product(r, p), Activation::silu)));
@@ -115,6 +126,13 @@ TEST_CASE("a norm that a product's kernels cannot begin, or its readers not end,
       [](GraphRunner& r, const LowerParams& p) {  // with a weight that is made after the product
         const Tensor x = first_product(r, p), weight = reshape(r.graph, slice(r.graph, x, 1, 3, 1), {24, 1, 1, 1});
         return two_products(r, p, r.graph.add(op::Norm{op::NormKind::rms, 1e-5f}, {x, scale(r.graph, weight, 2)}));
+      },
+      0, 1);
+  check(
+      [](GraphRunner& r, const LowerParams& p) {  // with such a bias
+        const Tensor x = first_product(r, p), bias = reshape(r.graph, slice(r.graph, x, 1, 3, 1), {24, 1, 1, 1});
+        const std::vector<Tensor> in = {x, p.parameter(r.graph, 24), scale(r.graph, bias, 2)};
+        return two_products(r, p, r.graph.add(op::Norm{op::NormKind::rms, 1e-5f}, in));
       },
       0, 1);
 }

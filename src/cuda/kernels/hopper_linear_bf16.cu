@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
+#include "cuda/kernels/halved_norm.h"
 #include "cuda/kernels/hopper_tile.h"
-#include "cuda/kernels/share.h"
 
 namespace vla::cuda {
 namespace {
@@ -14,6 +14,27 @@ struct Tile {
   static constexpr int kStages = hopper_stages(kColumns, kRows), kStage = hopper_stage_bytes(kColumns, kRows);
   static constexpr int kBytesW = kColumns * kSwizzledRow;
   static constexpr int kColumnsY = kGated ? kColumns / 2 : kColumns;
+};
+
+/// Ends the norm of x, if there is one. kHalves: 2 if there are columns of a gate.
+template <int kHalves>
+struct EndsNorm {
+  const LinearBf16Job& job;
+  NormedColumns<4> all[kHalves] = {};
+
+  template <class SumsOf>
+  VLA_DEVICE void load(SumsOf sums_of) {
+#pragma unroll
+    for (int half = 0; half < kHalves; ++half)
+      all[half].load(job, [&](int row, float(&to)[4]) {
+        const auto sums = sums_of(row, half > 0);
+#pragma unroll
+        for (int c = 0; c < 4; ++c) to[c] = sums.of[c];
+      });
+  }
+  VLA_DEVICE float operator()(const RowTerms& row, float sum, int c, bool of_gate) const {
+    return all[of_gate ? kHalves - 1 : 0].normed(row, sum, c);
+  }
 };
 
 /// Begins a norm of y.
@@ -38,7 +59,7 @@ VLA_DEVICE void multiply(const LinearBf16Job& job, int block) {
     if constexpr (T::kGated) fetch_gate(stage, step);
     fetch_matrix(stage + (T::kColumns - T::kColumnsY) * kSwizzledRow, step);
   };
-  const FetchRows<T::kRows, T::kThreads> fetch_x(job.x, job.x_stride * 2, row0, job.n_row, job.depth * 2);
+  const FetchRows<T::kRows, T::kThreads> fetch_x(job.x, job.x_stride * 2, row0, job.n_row_x(), job.depth * 2);
 
   float sum[T::kRows / 2] = {};
 #pragma unroll
@@ -50,7 +71,7 @@ VLA_DEVICE void multiply(const LinearBf16Job& job, int block) {
     if (i < n) fetch_x(shared + i * T::kStage + T::kBytesW, first + i);
     dev::commit_copies();  // commits a group even if it is empty, because waiting counts groups
   }
-  const float factor = thread_index() < T::kRows ? factor_of_row(job, row0 + thread_index()) : 1;
+  const RowTerms terms = thread_index() < T::kRows ? terms_of_row(job, row0 + thread_index()) : RowTerms();
   const std::uint64_t of_stage = T::kStage / 16;
   const std::uint64_t w0 = swizzled_descriptor(shared + thread_index() / 128 * 64 * kSwizzledRow);
   const std::uint64_t x0 = swizzled_descriptor(shared + T::kBytesW);
@@ -82,27 +103,30 @@ VLA_DEVICE void multiply(const LinearBf16Job& job, int block) {
   __syncthreads();  // the stages' memory is reused for sums
   using End = TileEnd<float, T::kColumns, T::kRows, T::kGated>;
   End::place(sum, shared);
-  std::byte* const factors = shared + T::kRows * (T::kColumns + 4) * 4;
-  static_assert(T::kRows <= T::kThreads && T::kRows * (T::kColumns + 5) * 4 <= T::kStages * T::kStage);
-  if (thread_index() < T::kRows) dev::write(factors + thread_index() * 4, factor);
-  const End end(job, job.gate_bias, row0, column0);
-  const auto factor_of = [&](int row) { return dev::read<float>(factors + (row - row0) * 4); };
-  const auto scaled = [](float of_row, float of_column, int) { return dev::multiply(of_column, of_row); };
+  std::byte* const all_terms = shared + T::kRows * (T::kColumns + 4) * 4;
+  static_assert(T::kRows <= T::kThreads && T::kRows * (T::kColumns + 6) * 4 <= T::kStages * T::kStage);
+  if (thread_index() < T::kRows) dev::write(all_terms + thread_index() * sizeof(RowTerms), terms);
+  const End end(job, job.gate_bias, job.partial ? job.n_row_x() : job.n_row, row0, column0);
+  const auto terms_of = [&](int row) { return dev::read<RowTerms>(all_terms + (row - row0) * sizeof(RowTerms)); };
+  const EndsNorm<T::kGated ? 2 : 1> ends = {job};
   if constexpr (T::kBegins)
-    end.finish(shared, factor_of, scaled, BeginsNorm{job});
+    end.finish(shared, terms_of, ends, BeginsNorm{job});
   else if (job.partial)
     end.leave(
-        shared, job.partial + static_cast<std::int64_t>(z) * job.n_row * job.n_sum(), [](int) { return 0; },
+        shared, job.partial + static_cast<std::int64_t>(z) * job.n_row_x() * job.n_sum(), [](int) { return 0; },
         [](int, float of_column) { return static_cast<unsigned>(dev::bits_of(of_column)); });
   else
-    end.finish(shared, factor_of, scaled);
+    end.finish(shared, terms_of, ends);
 }
 
 }  // namespace
 
-VLA_EARLY_KERNEL(hopper_linear_bf16_64x64_begins, 128, 1, LinearBf16Job) {
-  multiply<Tile<64, 64, false, true>>(job, static_cast<int>(blockIdx.y));
-}
+#define VLA_HOPPER_KERNEL(columns, rows)                                                            \
+  VLA_EARLY_KERNEL(hopper_linear_bf16_##columns##x##rows##_begins, columns * 2, 1, LinearBf16Job) { \
+    multiply<Tile<columns, rows, false, true>>(job, static_cast<int>(blockIdx.y));                  \
+  }
+VLA_HOPPER_BEGINNING_TILES(VLA_HOPPER_KERNEL)
+#undef VLA_HOPPER_KERNEL
 #define VLA_HOPPER_KERNEL(columns, rows)                                                   \
   VLA_EARLY_KERNEL(hopper_linear_bf16_##columns##x##rows, columns * 2, 1, LinearBf16Job) { \
     multiply<Tile<columns, rows, false>>(job, static_cast<int>(blockIdx.y));               \
@@ -120,6 +144,7 @@ VLA_HOPPER_GATED_TILES(VLA_HOPPER_KERNEL)
     run_one(job, blockIdx.y,                                                                                \
             [](const LinearBf16Job& one, int block) { multiply<Tile<columns, rows, false>>(one, block); }); \
   }
+VLA_HOPPER_BEGINNING_TILES(VLA_HOPPER_KERNEL)
 VLA_HOPPER_SEVERAL_TILES(VLA_HOPPER_KERNEL)
 #undef VLA_HOPPER_KERNEL
 

@@ -117,7 +117,7 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   __syncthreads();  // the stages' memory is reused for sums
   using End = TileEnd<int, T::kColumns, T::kRows, false>;
   End::place(sum, shared);
-  const End end(job, nullptr, row0, column0);
+  const End end(job, nullptr, job.n_row, row0, column0);
   // Ternary codes are stored plus 1, which adds the row's sum of codes, once in all shares.
   if (job.partial)
     return end.leave(
@@ -136,7 +136,7 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
   }
   end.finish(
       shared, [&](int row) { return RowRatios(job, row, scale, are_plain); },
-      [&](const RowRatios& of, int of_column, int c) {
+      [&](const RowRatios& of, int of_column, int c, bool) {
         return of.scaled(of_column - (T::kKind == CodeKind::ternary ? of.sum : 0), c);
       });
 }

@@ -57,16 +57,16 @@ template <class Sum, int kColumns, int kRows, bool kGated>
 class TileEnd {
  public:
   template <class Job>
-  VLA_DEVICE TileEnd(const Job& job, const float* gate_bias, int row0, int column0)
+  VLA_DEVICE TileEnd(const Job& job, const float* gate_bias, int n_row, int row0, int column0)
       : e_(job.end),
         gate_bias_(gate_bias),
         row0_(row0),
-        end_row_(job.n_row),
+        end_row_(n_row),
         n_split_(job.n_split),
         n_column_(job.n_column),
         column_(column0 + thread_index() % kQuads * 4) {
     n_ = job.n_column - column_;
-    const int left = job.n_row - row0;
+    const int left = n_row - row0;
     end_ = n_ <= 0 ? 0 : left < kRows ? left : kRows;
     const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
     const auto all = bits(e_.bias) | bits(e_.factor) | bits(e_.gate) | bits(e_.residual) | bits(e_.y) | bits(gate_bias);
@@ -93,8 +93,9 @@ class TileEnd {
     else
       leave_rows<1, false>(sums, partial, of_row, word);
   }
-  /// Computes y from value(of_row(row), a sum, index of the column among the thread's four), once all threads of the
-  /// block, or of the cluster, have called it. `then` also gets y, see LeavesY.
+  /// Computes y from value(of_row(row), a sum, index of the column among the thread's four, whether it is the gate's),
+  /// once all threads of the block, or of the cluster, have called it. If value has `load`, that is called before, with
+  /// a function that returns four sums of a row, of the gate or not. `then` also gets y, see LeavesY.
   template <class OfRow, class Value, class Then = LeavesY>
   VLA_DEVICE void finish(const std::byte* sums, OfRow of_row, Value value, Then then = {}) const {
     if (n_split_ == 1) {
@@ -159,6 +160,10 @@ class TileEnd {
       return from && n_ > 0 ? load_four(from + at, kTogether || together_, n_)
                             : Four{{otherwise, otherwise, otherwise, otherwise}};
     };
+    const auto sums_of_row = [&](int row, bool of_gate) {
+      return sums_of<kSplit>(sums, row - row0_, kGated && !of_gate ? 1 : 0);
+    };
+    if constexpr (requires { value.load(sums_of_row); }) value.load(sums_of_row);
     const Four bias = load(e_.bias, column_, kAddsNothing), factor = load(e_.factor, column_, kScalesNothing);
     const Four gate_bias = load(kGated ? gate_bias_ : nullptr, column_, kAddsNothing);
     const int end = Then::kTakesRows ? kRows : end_;
@@ -190,12 +195,13 @@ class TileEnd {
         if constexpr (!kSplit) read(i, row);
         if constexpr (kGated) {
 #pragma unroll
-          for (int c = 0; c < 4; ++c) gate[i].of[c] = dev::add(value(of[i], gate_sum[i].of[c], c), gate_bias.of[c]);
+          for (int c = 0; c < 4; ++c)
+            gate[i].of[c] = dev::add(value(of[i], gate_sum[i].of[c], c, true), gate_bias.of[c]);
         }
         Four y;
 #pragma unroll
         for (int c = 0; c < 4; ++c)
-          y.of[c] = cuda::finish(e_, kGated || e_.gate != nullptr, value(of[i], sum[i].of[c], c), bias.of[c],
+          y.of[c] = cuda::finish(e_, kGated || e_.gate != nullptr, value(of[i], sum[i].of[c], c, false), bias.of[c],
                                  factor.of[c], gate[i].of[c], residual[i].of[c], activate);
         if (!Then::kTakesRows || (row0_ + row < end_row_ && n_ > 0))
           store_y(e_, row0_ + row, column_, y, kTogether || together_, n_);

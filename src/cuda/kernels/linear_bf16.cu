@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "cuda/kernels/linear_bf16.h"
 
+#include "cuda/kernels/halved_norm.h"
 #include "cuda/kernels/share.h"
 #include "cuda/kernels/store_sums.h"
 
@@ -167,12 +168,12 @@ VLA_KERNEL(linear_bf16_few, 128, 4, LinearBf16Job) { multiply_few(job); }
 
 namespace {
 
-/// Adds four adjacent sums over all shares of the depth, in order, from column `at` of a row of sums on, and multiplies
-/// them by the row's factor; the first n exist. kTogether: all four exist and are aligned, and there are at most
+/// Adds four adjacent sums over all shares of the depth, in order, from column `at` of a row of sums on; the first n
+/// exist. kTogether: all four exist and are aligned, and there are at most
 /// kMostSplits shares, loaded at once.
 template <bool kTogether>
-VLA_DEVICE Four add_shares(const LinearBf16Job& job, int row, float factor, int at, int n) {
-  const std::int64_t apart = static_cast<std::int64_t>(job.n_row) * job.n_sum();
+VLA_DEVICE Four add_row(const LinearBf16Job& job, int row, int at, int n) {
+  const std::int64_t apart = static_cast<std::int64_t>(job.n_row_x()) * job.n_sum();
   const float* from = job.partial + static_cast<std::int64_t>(row) * job.n_sum() + at;
   Four sum = {};
   if constexpr (kTogether) {
@@ -191,22 +192,34 @@ VLA_DEVICE Four add_shares(const LinearBf16Job& job, int row, float factor, int 
       for (int c = 0; c < 4; ++c) sum.of[c] += share.of[c];
     }
   }
+  return sum;
+}
+/// The same, and ends the norm of x, if there is one.
+template <bool kTogether>
+VLA_DEVICE Four add_shares(const LinearBf16Job& job, int row, const RowTerms& terms, int at, int n) {
+  NormedColumns<4> all;
+  all.load(job, [&](int of, float(&to)[4]) {
+    const Four sum = add_row<kTogether>(job, of, at, n);
 #pragma unroll
-  for (int c = 0; c < 4; ++c) sum.of[c] = dev::multiply(sum.of[c], factor);
+    for (int c = 0; c < 4; ++c) to[c] = sum.of[c];
+  });
+  Four sum = add_row<kTogether>(job, row, at, n);
+#pragma unroll
+  for (int c = 0; c < 4; ++c) sum.of[c] = all.normed(terms, sum.of[c], c);
   return sum;
 }
 
 template <bool kTogether>
-VLA_DEVICE void finish_four(const LinearBf16Job& job, int row, float factor, int column) {
+VLA_DEVICE void finish_four(const LinearBf16Job& job, int row, const RowTerms& terms, int column) {
   const int n = job.n_column - column;
   const auto load = [&](const float* from, std::int64_t at) {
     return from ? load_four(from + at, kTogether, n) : Four{};
   };
-  const Four sum = add_shares<kTogether>(job, row, factor, job.n_sum() - job.n_column + column, n);
+  const Four sum = add_shares<kTogether>(job, row, terms, job.n_sum() - job.n_column + column, n);
   Four gate = load(job.end.gate, static_cast<std::int64_t>(row) * job.n_column + column);
   if (job.gate_weight) {
     const Four bias = load(job.gate_bias, column);
-    gate = add_shares<kTogether>(job, row, factor, column, n);
+    gate = add_shares<kTogether>(job, row, terms, column, n);
 #pragma unroll
     for (int c = 0; c < 4; ++c) gate.of[c] = dev::add(gate.of[c], bias.of[c]);
   }
@@ -215,12 +228,12 @@ VLA_DEVICE void finish_four(const LinearBf16Job& job, int row, float factor, int
 
 /// Adds the shares of four adjacent pairs of a head, and stores both elements of each rotated.
 template <bool kTogether>
-VLA_DEVICE void finish_four_pairs(const LinearBf16Job& job, int row, float factor, int pair) {
+VLA_DEVICE void finish_four_pairs(const LinearBf16Job& job, int row, const RowTerms& terms, int pair) {
   const int column = job.rotation.first_column(pair), half = job.rotation.d_head / 2;
   const float* const cosines = cosines_of(job.rotation, row, column);
   const Four cosine = load_four(cosines, kTogether, 4), sine = load_four(cosines + half, kTogether, 4);
   const auto add = [&](int from) {
-    Four sum = add_shares<kTogether>(job, row, factor, from, 4);
+    Four sum = add_shares<kTogether>(job, row, terms, from, 4);
     if (job.end.bias == nullptr) return sum;
     const Four bias = load_four(job.end.bias + from, kTogether, 4);
 #pragma unroll
@@ -241,11 +254,11 @@ VLA_DEVICE void finish_partial(const LinearBf16Job& job, int block) {
   const auto bits = [](const void* p) { return reinterpret_cast<std::uint64_t>(p); };
   const auto others = bits(job.gate_bias) | bits(job.partial) | bits(job.rotation.table);
   const bool together = is_of_fours(job.end, job.n_column) && others % 16 == 0 && job.n_split <= kMostSplits;
-  const float factor = factor_of_row(job, row);
+  const RowTerms terms = terms_of_row(job, row);
   if (rotates)
-    together ? finish_four_pairs<true>(job, row, factor, four) : finish_four_pairs<false>(job, row, factor, four);
+    together ? finish_four_pairs<true>(job, row, terms, four) : finish_four_pairs<false>(job, row, terms, four);
   else
-    together ? finish_four<true>(job, row, factor, four) : finish_four<false>(job, row, factor, four);
+    together ? finish_four<true>(job, row, terms, four) : finish_four<false>(job, row, terms, four);
 }
 
 }  // namespace

@@ -21,18 +21,31 @@ struct Rotation {
   }
 };
 
-/// The first half of an RMS norm of y; products of the norm do the other half (NormEnd).
-struct NormBegin {
-  std::uint16_t* rows = nullptr;  // y * weight in bf16, with a stride that is even; null: no norm begins
-  std::int64_t stride = 0;
-  const float* weight = nullptr;  // [n_column], or null
-  float* squares = nullptr;       // [n_row, n_part]: sums of y * y over parts of each row, see norm_part()
+/// What a product that begins a norm leaves of its rows: sums over parts of `part` columns each, the last part may have
+/// fewer.
+struct RowMoments {
+  float* squares = nullptr;  // [n_row, n_part]: squares of y, or for a layer norm of y minus the part's mean
+  float* sums = nullptr;     // [n_row, n_part], or null for an RMS norm
+  int n_part = 0, part = 0;
 };
-/// The other half: x is such rows, so sums are multiplied by their row's 1 / sqrt(mean of squares + eps).
+/// The first half of a norm of y; products of the norm do the other half (NormEnd).
+struct NormBegin {
+  /// y * weight in bf16, with a stride that is even. The rows that NormEnd::n_more() counts follow: the weight, for a
+  /// layer norm, and the bias, if there is one. Null: no norm begins.
+  std::uint16_t* rows = nullptr;
+  std::int64_t stride = 0;
+  const float *weight = nullptr, *bias = nullptr;  // [n_column], or null
+  RowMoments moments = {};
+};
+/// The other half: x is such rows, of x' without the norm. The norm's product is factor * (x' w^T - mean * weight w^T)
+/// + bias w^T with factor = 1 / sqrt(variance + eps), for an RMS norm with a mean of 0.
 struct NormEnd {
-  const float* squares = nullptr;  // [n_row, n_part]; null: x has no norm to end
-  int n_part = 0;
+  RowMoments moments = {};  // without squares: x has no norm to end
   float eps = 0;
+  bool has_bias = false;
+
+  /// Rows of x after the last of y. With such rows, a block must have all rows.
+  VLA_HOST_DEVICE int n_more() const { return (moments.sums != nullptr ? 1 : 0) + (has_bias ? 1 : 0); }
 };
 
 struct LinearBf16Job {
@@ -41,7 +54,7 @@ struct LinearBf16Job {
   const std::uint16_t* weight;  // n_column rows with stride weight_stride, a multiple of 8
   std::int64_t x_stride, weight_stride;
   int n_row, n_column, depth;  // elements of a row after the depth are ignored
-  /// With more than one split, each writes its sums over a share of the depth to partial [n_column, n_row, n_split];
+  /// With more than one split, each writes its sums over a share of the depth to partial [n_sum(), n_row_x(), n_split];
   /// `finish_bf16_partial` adds them in order and computes y. Without `partial`, Hopper's tiles add them in the same
   /// order in clusters of up to kMaxCluster blocks.
   int n_split;
@@ -56,10 +69,11 @@ struct LinearBf16Job {
   /// Only for undivided strips of up to 64 columns without halves, and Hopper's tiles that have a kernel for it, if
   /// they compute y: without activation, gate and final ReLU.
   NormBegin norm_begin = {};
-  /// Not for `few`, rows64 and rows128, unless finish_bf16_partial adds the shares.
+  /// Only for strips and Hopper's tiles; with n_more() == 0 also where finish_bf16_partial adds the shares.
   NormEnd norm_end = {};
 
   VLA_HOST_DEVICE int n_sum() const { return gate_weight ? 2 * n_column : n_column; }  // per row
+  VLA_HOST_DEVICE int n_row_x() const { return n_row + norm_end.n_more(); }
 };
 
 /// The shape of a block. few: kBf16FewRows rows, where reading the matrix once is the bottleneck. stripN: N columns and
@@ -101,7 +115,7 @@ inline Launch linear_strip(unsigned width, const LinearBf16Job& job) {
   return {kNames[kind][which],
           {blocks(job.n_sum(), width), blocks(job.n_row, 64), static_cast<unsigned>(job.n_split)},
           256,
-          (n_sum * 64 * (width + 8) + 64) * 4};
+          (n_sum * 64 * (width + 8) + 2 * 64) * 4};
 }
 /// Several products in strips of the same width, rows and depth, without gates and splits. If any is rotated, all must
 /// have a multiple of four columns.
@@ -132,14 +146,16 @@ inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
 }
 
 /// Tiles of the kernels for Hopper only (hopper_linear_bf16.cu): columns, a multiple of 64, and rows, a multiple of 16.
-/// These have a second kernel, for several products in one launch:
-#define VLA_HOPPER_SEVERAL_TILES(each)                                                                               \
-  each(64, 64) each(128, 48) each(128, 64) each(128, 96) each(128, 112) each(128, 128) each(128, 192) each(192, 112) \
-      each(192, 192)
+/// These have a second kernel, for several products in one launch, and a third, which begins a norm:
+#define VLA_HOPPER_BEGINNING_TILES(each) each(64, 64) each(128, 48) each(128, 64)
+/// These have the second:
+#define VLA_HOPPER_SEVERAL_TILES(each) \
+  each(128, 96) each(128, 112) each(128, 128) each(128, 192) each(192, 112) each(192, 192)
 #define VLA_HOPPER_OTHER_TILES(each)                                                                     \
   each(192, 48) each(64, 128) each(128, 144) each(128, 160) each(128, 176) each(128, 224) each(128, 256) \
       each(192, 160) each(192, 224) each(256, 112) each(256, 128) each(256, 160)
-#define VLA_HOPPER_TILES(each) VLA_HOPPER_SEVERAL_TILES(each) VLA_HOPPER_OTHER_TILES(each)
+#define VLA_HOPPER_TILES(each) \
+  VLA_HOPPER_BEGINNING_TILES(each) VLA_HOPPER_SEVERAL_TILES(each) VLA_HOPPER_OTHER_TILES(each)
 /// The same for gated products. Half of a tile's columns belong to the gate's matrix, half to the other.
 #define VLA_HOPPER_GATED_TILES(each)                                                                     \
   each(128, 64) each(128, 96) each(128, 128) each(128, 160) each(128, 192) each(128, 224) each(128, 256) \
@@ -149,22 +165,25 @@ struct HopperTile {
   int columns, rows;
   bool is_gated = false;
   const char* several = nullptr;  // the kernel of several products
+  const char* begins = nullptr;   // the kernel that begins a norm
 };
 constexpr HopperTile kHopperTiles[] = {
+#define VLA_HOPPER_TILE(columns, rows)                                                                                 \
+  {"hopper_linear_bf16_" #columns "x" #rows,          columns, rows, false, "hopper_linears_bf16_" #columns "x" #rows, \
+   "hopper_linear_bf16_" #columns "x" #rows "_begins"},
+    VLA_HOPPER_BEGINNING_TILES(VLA_HOPPER_TILE)
+#undef VLA_HOPPER_TILE
 #define VLA_HOPPER_TILE(columns, rows) \
   {"hopper_linear_bf16_" #columns "x" #rows, columns, rows, false, "hopper_linears_bf16_" #columns "x" #rows},
-    VLA_HOPPER_SEVERAL_TILES(VLA_HOPPER_TILE)
+        VLA_HOPPER_SEVERAL_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 #define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_bf16_" #columns "x" #rows, columns, rows},
-        VLA_HOPPER_OTHER_TILES(VLA_HOPPER_TILE)
+            VLA_HOPPER_OTHER_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 #define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_bf16_" #columns "x" #rows "_gated", columns, rows, true},
-            VLA_HOPPER_GATED_TILES(VLA_HOPPER_TILE)
+                VLA_HOPPER_GATED_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 };
-/// The first tile also has a kernel that begins a norm.
-constexpr std::size_t kHopperBegins = 0;
-constexpr const char* kHopperBeginsKernel = "hopper_linear_bf16_64x64_begins";
 constexpr int kHopperDepth = 64;  // step of the depth, and unit of a split: each share has at least one
 /// Bytes of a step, and the number of steps in shared memory: eight, or fewer if kHopperShared holds fewer.
 constexpr int hopper_stage_bytes(int columns, int rows) { return (columns + rows) * kHopperDepth * 2; }
@@ -174,7 +193,7 @@ constexpr int hopper_stages(int columns, int rows) {
 }
 inline Launch hopper_linear_bf16(const HopperTile& tile, const LinearBf16Job& job) {
   // Adjacent blocks read the same columns, so the matrix is read from memory once.
-  return {job.norm_begin.rows != nullptr ? kHopperBeginsKernel : tile.kernel,
+  return {job.norm_begin.rows != nullptr ? tile.begins : tile.kernel,
           {blocks(job.n_row, tile.rows), blocks(job.n_column, tile.is_gated ? tile.columns / 2 : tile.columns),
            static_cast<unsigned>(job.n_split)},
           static_cast<unsigned>(tile.columns) * 2,

@@ -1,5 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
+#include "cuda/kernels/halved_norm.h"
 #include "cuda/kernels/share.h"
 
 namespace vla::cuda {
@@ -39,7 +40,7 @@ class Operands {
     const auto nearest = [](int i, int n) { return i < n ? i : n - 1; };
 #pragma unroll
     for (int r = 0; r < 2 * kTilesM; ++r)
-      x_place_[r] = static_cast<unsigned>((nearest(row0 + r * 8 + lane / 4, job.n_row) - row0) * job.x_stride * 2);
+      x_place_[r] = static_cast<unsigned>((nearest(row0 + r * 8 + lane / 4, job.n_row_x()) - row0) * job.x_stride * 2);
 #pragma unroll
     for (int n = 0; n < S::kTilesN; ++n) {
       const int column = of_warp + n * 8;
@@ -106,13 +107,12 @@ struct Stores {
   }
 };
 
-/// Where shared memory has the factor of a row's sums.
+/// Where shared memory has a row's RowTerms.
 template <class S>
-VLA_DEVICE std::byte* place_of_factor(int row) {
-  return dev::shared_memory() + S::kWarpsK * kStripRows * S::kRowBytes + row * 4;
+VLA_DEVICE std::byte* place_of_terms(int row) {
+  return dev::shared_memory() + S::kWarpsK * kStripRows * S::kRowBytes + row * sizeof(RowTerms);
 }
-/// Adds the sums of the warps that share two columns, from `column` on, in the warps' order, and multiplies by the
-/// row's factor.
+/// Adds the sums of the warps that share two columns, from `column` on, in the warps' order.
 template <class S>
 VLA_DEVICE float2 add_warps(int row, int column) {
   float2 sum = {0, 0};
@@ -121,26 +121,47 @@ VLA_DEVICE float2 add_warps(int row, int column) {
     const auto pair = dev::read<float2>(dev::shared_memory() + (w * kStripRows + row) * S::kRowBytes + column * 4);
     sum.x += pair.x, sum.y += pair.y;
   }
-  const auto factor = dev::read<float>(place_of_factor<S>(row));
-  return {dev::multiply(sum.x, factor), dev::multiply(sum.y, factor)};
+  return sum;
 }
+
+/// Ends the norm of x, if there is one, in two columns of the strip from `column` on.
+template <class S>
+struct NormedPair {
+  int column;
+  NormedColumns<2> all = {};
+
+  /// Sums of all warps must be there.
+  VLA_DEVICE NormedPair(const LinearBf16Job& job, int first) : column(first) {
+    if (job.n_split == 1)
+      all.load(job, [&](int row, float(&to)[2]) {
+        const float2 sum = add_warps<S>(row, column);
+        to[0] = sum.x, to[1] = sum.y;
+      });
+  }
+  VLA_DEVICE float2 operator()(int row) const {
+    const float2 sum = add_warps<S>(row, column);
+    const auto terms = dev::read<RowTerms>(place_of_terms<S>(row));
+    return {all.normed(terms, sum.x, 0), all.normed(terms, sum.y, 1)};
+  }
+};
 
 /// Adds the sums of warps that share columns, stores pairs of y, and begins a norm of it if the strip does that.
 template <class S>
 VLA_DEVICE void add_and_store(const LinearBf16Job& job, int row0, int column0) {
   const Stores<S> mine;
   const int column = column0 + mine.column;
-  const auto valid = [&](int row) { return row0 + row < job.n_row && column < job.n_column; };
+  const int n_row = job.n_split == 1 ? job.n_row : job.n_row_x();
+  const auto valid = [&](int row) { return row0 + row < n_row && column < job.n_column; };
   PairEnds ends[mine.kEach];
 #pragma unroll
   for (int i = 0; i < mine.kEach; ++i)
     if (job.n_split == 1 && valid(mine.row(i))) ends[i] = load_ends(job.end, row0 + mine.row(i), column, job.n_column);
   __syncthreads();  // sums of all warps are there
+  const NormedPair<S> of_gate(job, mine.column), of_y(job, S::kColumns - S::kColumnsY + mine.column);
 #pragma unroll
   for (int i = 0; i < mine.kEach; ++i) {
     const int row = mine.row(i);
-    const float2 gate = S::kGated ? add_warps<S>(row, mine.column) : float2{0, 0};
-    const float2 sum = add_warps<S>(row, S::kColumns - S::kColumnsY + mine.column);
+    const float2 gate = S::kGated ? of_gate(row) : float2{0, 0}, sum = of_y(row);
     if constexpr (S::kBegins) {
       float2 y = {0, 0};
       if (valid(row)) y = finish_pair(job.end, ends[i], sum.x, sum.y, row0 + row, column);
@@ -180,10 +201,11 @@ VLA_DEVICE void add_and_rotate(const LinearBf16Job& job, int row0, int pair0) {
     turn[i][0] = cosine[0], turn[i][1] = cosine[1], turn[i][2] = cosine[half], turn[i][3] = cosine[half + 1];
   }
   __syncthreads();  // sums of all warps are there
+  const NormedPair<S> of_first(job, mine.column), of_second(job, S::kColumnsY + mine.column);
 #pragma unroll
   for (int i = 0; i < mine.kEach; ++i) {
     const int row = mine.row(i);
-    const float2 first = add_warps<S>(row, mine.column), second = add_warps<S>(row, S::kColumnsY + mine.column);
+    const float2 first = of_first(row), second = of_second(row);
     if (!is_valid || row0 + row >= job.n_row) continue;
     float low[2] = {dev::add(first.x, low_bias.x), dev::add(first.y, low_bias.y)};
     float high[2] = {dev::add(second.x, high_bias.x), dev::add(second.y, high_bias.y)};
@@ -209,7 +231,8 @@ VLA_DEVICE void multiply_strip(const LinearBf16Job& job, int block) {
 #pragma unroll
   for (int i = 0; i < S::kAhead; ++i) operands.load_x(ahead[i], first + i * S::kWarpsK);
   if (thread_index() < kStripRows)
-    dev::write(place_of_factor<S>(thread_index()), job.n_split > 1 ? 1 : factor_of_row(job, row0 + thread_index()));
+    dev::write(place_of_terms<S>(thread_index()),
+               job.n_split > 1 ? RowTerms() : terms_of_row(job, row0 + thread_index()));
   float sum[kTilesM][S::kTilesN][4] = {};
 #pragma unroll 1
   for (int step = first; step < share.end; step += S::kAhead * S::kWarpsK) {

@@ -9,7 +9,7 @@ namespace vla::cuda {
 
 /// Stores two adjacent sums over a share of the depth to columns `at` and at + 1 of a row of `partial`.
 VLA_DEVICE void store_partial(const LinearBf16Job& job, float first, float second, int row, int at, bool has_second) {
-  float* to = job.partial + (static_cast<std::int64_t>(blockIdx.z) * job.n_row + row) * job.n_sum() + at;
+  float* to = job.partial + (static_cast<std::int64_t>(blockIdx.z) * job.n_row_x() + row) * job.n_sum() + at;
   if (has_second && job.n_sum() % 2 == 0 && at % 2 == 0) {
     *reinterpret_cast<float2*>(to) = float2{first, second};
   } else {
@@ -34,44 +34,6 @@ VLA_DEVICE void add_gate_bias(const LinearBf16Job& job, PairEnds& ends, int colu
 /// The cosines of a row's token from the pair at `column` on; the sines follow after d_head / 2 values.
 VLA_DEVICE const float* cosines_of(const Rotation& rotation, int row, int column) {
   return rotation.table + row % rotation.n_token * rotation.d_head + column % rotation.d_head;
-}
-
-/// What sums of a row are multiplied by: ends the norm of x that another product began.
-VLA_DEVICE float factor_of_row(const LinearBf16Job& job, int row) {
-  const NormEnd& norm = job.norm_end;
-  if (norm.squares == nullptr || row >= job.n_row) return 1;
-  float squares = 0;
-#pragma unroll 8
-  for (int part = 0; part < norm.n_part; ++part)
-    squares += norm.squares[static_cast<std::int64_t>(part) * job.n_row + row];
-  return 1 / sqrtf(squares / static_cast<float>(job.depth) + norm.eps);
-}
-
-/// Begins the norm of a row of y, which has kCount adjacent columns from `column` on in each of kLanesOfPart lanes. All
-/// lanes of the warp must call it, also those of rows and columns after the last.
-template <int kLanesOfPart, int kCount>
-VLA_DEVICE void begin_norm(const LinearBf16Job& job, int row, int column, const float (&y)[kCount]) {
-  const NormBegin& norm = job.norm_begin;
-  float squares = 0;
-#pragma unroll
-  for (int c = 0; c < kCount; ++c) squares += column + c < job.n_column ? y[c] * y[c] : 0;
-#pragma unroll
-  for (int mask = kLanesOfPart / 2; mask > 0; mask /= 2) squares += dev::shuffle_xor(squares, mask);
-  if (row >= job.n_row) return;
-  if (thread_index() % kLanesOfPart == 0)
-    norm.squares[static_cast<std::int64_t>(column / (kLanesOfPart * kCount)) * job.n_row + row] = squares;
-#pragma unroll
-  for (int c = 0; c < kCount; c += 2) {
-    const int n = job.n_column - column - c;
-    if (n <= 0) break;
-    const float first = norm.weight ? norm.weight[column + c] : 1;
-    const float second = norm.weight && n > 1 ? norm.weight[column + c + 1] : 1;
-    std::uint16_t* to = norm.rows + row * norm.stride + column + c;
-    if (n > 1)
-      store_pair(to, true, 0, y[c] * first, y[c + 1] * second);
-    else
-      store(to, true, 0, y[c] * first);
-  }
 }
 
 /// The steps of the depth that block z of a split computes.

@@ -47,13 +47,17 @@ struct HeadRotation {
   std::int64_t d_head = 0, n_token = 0;
 };
 
-/// An RMS norm that one product begins and others end (cuda::NormBegin, cuda::NormEnd).
+/// A norm that one product begins and others end (cuda::NormBegin, cuda::NormEnd).
 struct HalvedNorm {
-  ValueId squares = kNone;  // [n_row, n_part]; kNone: there is no such norm
-  ValueId rows = kNone;     // what the norm's products read
-  ValueId weight = kNone;
-  int n_part = 0;
+  ValueId squares = kNone, sums = kNone;  // moments, [n_row, n_part]; without squares there is no such norm
+  ValueId rows = kNone;                   // what the norm's products read
+  ValueId weight = kNone, bias = kNone;
+  int n_part = 0, part = 0;
   float eps = 0;
+
+  /// The values that the norm's products read beside `rows`.
+  std::vector<ValueId> moments() const { return sums == kNone ? std::vector{squares} : std::vector{squares, sums}; }
+  int n_more() const { return (sums != kNone ? 1 : 0) + (bias != kNone ? 1 : 0); }  // cuda::NormEnd::n_more()
 };
 
 struct CudaOp : Step {
@@ -102,7 +106,7 @@ struct CudaLowering : Lowering {
 /// value whose only reader is such a conversion is stored converted, and some products rotate the heads that they make.
 /// Also splits the depth of products, and lets norms add the shares.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
-/// Lets products begin and end RMS norms where that is faster than an operation for the norm, and removes those
+/// Lets products begin and end norms where that is faster than an operation for the norm, and removes those
 /// operations. For a step of choose_layouts, before shares have values.
 void halve_norms(CudaLowering& l);
 /// The operation whose first result is this value, or null.

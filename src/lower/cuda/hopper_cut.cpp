@@ -71,9 +71,11 @@ std::vector<Candidate> candidates(MatrixKind kind, HopperCutFor what) {
   std::vector<Candidate> all;
   if (kind == MatrixKind::bf16)
     for (std::size_t i = 0; i < std::size(cuda::kHopperTiles); ++i) {
-      const auto& [kernel, columns, rows, is_gated, several] = cuda::kHopperTiles[i];
-      if (what == HopperCutFor::begins_norm && i != cuda::kHopperBegins) continue;
-      if (is_gated != (what == HopperCutFor::gated) || (what == HopperCutFor::several && several == nullptr)) continue;
+      const auto& [kernel, columns, rows, is_gated, several, begins] = cuda::kHopperTiles[i];
+      if (is_gated != (what == HopperCutFor::gated)) continue;
+      if ((what == HopperCutFor::several && several == nullptr) ||
+          (what == HopperCutFor::begins_norm && begins == nullptr))
+        continue;
       all.push_back({i, columns, rows, (columns + rows) * 128});
     }
   const bool is_ternary = kind == MatrixKind::ternary;

@@ -89,7 +89,8 @@ class CudaLayouts final : Layouts<CudaLowering> {
   }
   /// The number of sums in one share of the depth.
   static std::int64_t n_sum(const CudaOp& op, const LinearOp& product) {
-    return count(product.linears[0]->shape) * (product.gated && op.gate == kNone ? 2 : 1);
+    const Shape& y = product.linears[0]->shape;
+    return (count(y) + op.ends.n_more() * y[0]) * (product.gated && op.gate == kNone ? 2 : 1);
   }
   /// Whether an operation is a product of one bf16 matrix that reads nothing but x.
   bool is_plain_product(const CudaOp& op) const {

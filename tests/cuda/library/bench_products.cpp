@@ -153,7 +153,7 @@ class Bench {
         if (jobs[0].partial != nullptr) launches.push_back(finish_bf16_partial(jobs[0]));
         const std::string name = shape_name(tile.kernel, in_cluster);
         VLA_CHECK(tell(tile.is_gated ? "bf16 gated" : "bf16", size, name.c_str(), n_split, jobs, launches));
-        if (&tile == &kHopperTiles[kHopperBegins] && jobs[0].partial == nullptr) {
+        if (tile.begins != nullptr && jobs[0].partial == nullptr) {
           for (LinearBf16Job& job : jobs)
             job.norm_begin = {rows.as<std::uint16_t>(), stride_of_rows, bias.as<float>(), squares.as<float>()};
           launches = {hopper_linear_bf16(tile, jobs[0])};

@@ -15,9 +15,16 @@ cuda::Int8Shape int8_shape(cuda::Bf16Shape shape) {
                                             : cuda::Int8Shape::rows128;
 }
 
+cuda::RowMoments moments(const CudaLowering& l, const HalvedNorm& norm) {
+  return {l.at(norm.squares), l.at(norm.sums), norm.n_part, norm.part};
+}
 cuda::NormBegin norm_begin(const CudaLowering& l, const HalvedNorm& norm) {
   if (norm.squares == kNone) return {};
-  return {l.at<std::uint16_t>(norm.rows), l.value(norm.rows).stride[1], l.at(norm.weight), l.at(norm.squares)};
+  return {.rows = l.at<std::uint16_t>(norm.rows),
+          .stride = l.value(norm.rows).stride[1],
+          .weight = l.at(norm.weight),
+          .bias = l.at(norm.bias),
+          .moments = moments(l, norm)};
 }
 
 /// gate: the gate product, if the same kernel computes it with this one; else null.
@@ -54,7 +61,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
           .gate_bias = gate ? l.param(gate->bias) : nullptr,
           .rotation = {l.at(op.rotation.table), narrow(op.rotation.d_head), narrow(op.rotation.n_token)},
           .norm_begin = norm_begin(l, op.begins),
-          .norm_end = {l.at(op.ends.squares), op.ends.n_part, op.ends.eps}};
+          .norm_end = {moments(l, op.ends), op.ends.eps, op.ends.bias != kNone}};
       calls.push_back(
           call(tile ? cuda::hopper_linear_bf16(cuda::kHopperTiles[*tile], job) : cuda::linear_bf16(shape, job), job));
       if (op.partial != kNone && !leaves_shares(op)) calls.push_back(call(cuda::finish_bf16_partial(job), job));
