@@ -13,6 +13,7 @@
 #include "cuda/machine.h"
 #include "devices/devices.h"
 #include "lower/cuda/cuda_device.h"
+#include "lower/lower_case.h"
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
 
@@ -112,12 +113,48 @@ TEST_CASE("products of bf16 give a chunk nearer to the float32 reference than Py
 
 TEST_CASE("attention of few queries fills a device, and of many takes the keys one tile after the other") {
   const auto blocks = [](std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm) {
-    const lower::AttentionPlan plan = lower::plan_attention(d_head, n_row, n_unit, n_key, n_sm);
+    const lower::AttentionPlan plan = lower::plan_attention(d_head, n_row, n_unit, n_key, n_sm, false);
     CHECK(plan.shape->depth >= d_head);
     CHECK(plan.n_split <= vla::cuda::kMaxAttentionSplit);
     return (n_row + plan.shape->rows - 1) / plan.shape->rows * n_unit * plan.n_split;
   };
   CHECK(blocks(72, 16, 1, 1 << 16, 132) >= 8);
+}
+
+TEST_CASE("a cluster combines the shares of attention on Hopper alone, and where that is estimated to be faster") {
+  int n_cluster = 0;
+  for (const std::int64_t d_head : {64, 128, 256})
+    for (const std::int64_t n_row : {16, 400, 4000})
+      for (const std::int64_t n_key : {60, 300, 1200, 5000}) {
+        const lower::AttentionPlan elsewhere = lower::plan_attention(d_head, n_row, 1, n_key, 132, false),
+                                   hopper = lower::plan_attention(d_head, n_row, 1, n_key, 132, true);
+        INFO(n_row, " rows, heads of ", d_head, ", ", n_key, " keys: ", hopper.shape->kernel, ", ", hopper.n_split);
+        CHECK(!elsewhere.in_cluster);
+        CHECK(hopper.in_cluster == (hopper.us < elsewhere.us));
+        CHECK((!hopper.in_cluster || hopper.shape->fits_cluster(hopper.n_split)));
+        n_cluster += hopper.in_cluster ? 1 : 0;
+      }
+  CHECK(n_cluster > 0);
+  CHECK(n_cluster < 36);
+}
+
+TEST_CASE("a graph's attention in a cluster is a launch less, and as near to the reference") {
+  const LowerParams params(DType::bf16);  // attention reads bf16 where matrices are bf16
+  const auto attend = [](GraphRunner& r, const LowerParams&) {
+    const Tensor k = input(r, {256, 1, 300, 1}), v = input(r, {256, 1, 300, 1}, 2);
+    return attention(r.graph, input(r, {256, 8, 5, 1}), {{k, v}}, {});
+  };
+  const std::vector<float> expected = result_of("ggml", params, attend);
+  long n_launch[2] = {};
+  for (const int major : {9, 8}) {
+    if (major == 8 && test::cuda::runs_ptx()) continue;  // of Hopper alone
+    test::cuda::reset_fake_driver();
+    test::cuda::fake_driver().major = major, test::cuda::fake_driver().n_sm = 132;
+    check_close(result_of("", params, attend), expected, 4e-3);
+    n_launch[9 - major] = test::cuda::fake_driver().n_call["cuLaunchKernelEx"];
+  }
+  if (!test::cuda::runs_ptx()) CHECK(n_launch[0] == n_launch[1] - 1);
+  test::cuda::reset_fake_driver();
 }
 
 TEST_CASE("attention takes the shape and the shares that were fastest on an H200, or within a tenth of it") {
@@ -139,7 +176,8 @@ TEST_CASE("attention takes the shape and the shares that were fastest on an H200
       {128, 2568, 5, 642, {{"attention_bf16_128", 1}}},                                   // BitVLA, language
   };
   for (const Size& size : sizes) {
-    const lower::AttentionPlan plan = lower::plan_attention(size.d_head, size.n_row, size.n_unit, size.n_key, 132);
+    const lower::AttentionPlan plan =
+        lower::plan_attention(size.d_head, size.n_row, size.n_unit, size.n_key, 132, false);
     INFO(size.d_head, " of a head, ", size.n_key, " keys: ", plan.shape->kernel, ", shares ", plan.n_split);
     CHECK(std::find(size.fast.begin(), size.fast.end(),
                     std::pair<std::string, int>(plan.shape->kernel, plan.n_split)) != size.fast.end());
