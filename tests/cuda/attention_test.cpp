@@ -22,6 +22,7 @@ struct Case {
   int n_query, n_head, n_head_kv, n_batch, d_head, n_split;
   std::vector<int> segments;
   bool has_mask = false;
+  int n_hidden = 0;  // of a mask: keys at the end that every second query does not see
 };
 // Towers (72 and 80 wide, a batch of views), grouped heads, a prefix of keys before the step's own, few queries with
 // keys split, the widest head, heads that no tile divides, and keys of several tiles in segments that end within them.
@@ -35,6 +36,12 @@ const Case kCases[] = {{70, 2, 2, 2, 72, 1, {70}},
                        {11, 6, 2, 1, 40, 2, {90, 41}},
                        {9, 4, 1, 2, 128, 2, {70, 210}, true},
                        {4, 10, 1, 1, 256, 1, {70, 63}, true}};
+// For every depth of a cluster's kernels: shares without keys, shares of which some rows see nothing, rows that fill no
+// tile or end in one, heads that are less than the depth, and clusters of as many blocks as there may be.
+const Case kClusterCases[] = {
+    {9, 6, 2, 2, 40, 8, {100, 0, 60}, true, 70}, {13, 4, 1, 1, 64, 3, {290, 5}},         {1, 2, 2, 1, 24, 5, {33, 1}},
+    {5, 8, 2, 1, 128, 2, {70, 150}, true},       {19, 2, 1, 2, 96, 7, {200}, true, 90},  {33, 1, 1, 1, 256, 5, {300}},
+    {4, 10, 1, 1, 200, 8, {70, 63}, true, 60},   {5, 8, 1, 2, 256, 3, {100, 0, 5}, true}};
 
 /// q, k and v as one projection leaves them: rows of all heads side by side, one token after the other.
 class Trial {
@@ -48,6 +55,8 @@ class Trial {
     mask = numbers.floats(c.n_query * n_key);
     for (std::size_t i = 0; i < mask.size(); ++i)
       if (i % 7 == 3 && i % static_cast<std::size_t>(n_key) != 0) mask[i] = -INFINITY;
+    for (int query = 0; query < c.n_query; query += 2)
+      std::fill_n(mask.begin() + (query + 1) * n_key - c.n_hidden, c.n_hidden, -INFINITY);
   }
 
   std::vector<double> expected() const {
@@ -76,9 +85,10 @@ class Trial {
     return y;
   }
 
-  /// y by the kernel that `how` launches, of elements that `convert` makes.
+  /// y by the kernel that `how` launches, of elements that `convert` makes. in_cluster: no other kernel combines
+  /// shares.
   template <class T, class How, class Convert>
-  std::vector<float> run(How how, bool y_is_bf16, Convert convert) const {
+  std::vector<float> run(How how, bool y_is_bf16, Convert convert, bool in_cluster = false) const {
     const Device<T> gq(convert(q)), gk(convert(k)), gv(convert(v));
     const Device<float> gmask(mask), y(q.size());
     const Device<std::uint16_t> half(q.size());
@@ -101,9 +111,9 @@ class Trial {
     job.d_head = c.d_head, job.n_split = c.n_split;
     const Device<float> partial(
         static_cast<std::size_t>((c.d_head + 2) * c.n_head * c.n_query * c.n_batch * c.n_split));
-    job.partial = partial.get();
+    job.partial = in_cluster ? nullptr : partial.get();
     launch(how(job), job);
-    if (c.n_split > 1) launch(finish_attention(job), job);
+    if (c.n_split > 1 && !in_cluster) launch(finish_attention(job), job);
     return y_is_bf16 ? widened(half.host()) : y.host();
   }
 
@@ -150,6 +160,36 @@ TEST_CASE("attention on bf16 is within a rounding of its weights of doubles in e
       ++n_run;
     }
     CHECK(n_run > 0);
+  }
+  CHECK(counts.bank_conflicts == 0);
+}
+
+TEST_CASE("attention on bf16 in clusters is what another kernel makes of the shares, to the bit") {
+  if (!is_hopper()) {
+    MESSAGE("skipped: no device of compute capability 9.0");
+    return;
+  }
+  counts = {};
+  for (const AttentionShape& shape : kAttentionShapes) {
+    int n_run = 0;
+    for (const Case& c : kClusterCases) {
+      if (depth_of(c.d_head) != shape.depth || !shape.fits_cluster(c.n_split)) continue;
+      const Trial trial(c);
+      INFO(shape.kernel, ": ", c.n_query, " queries, heads of ", c.d_head, ", ", c.n_split, " shares");
+      const auto run = [&](bool y_is_bf16, bool in_cluster) {
+        const auto how = [&](const AttentionJob& job) { return attention_bf16(shape, job); };
+        const auto halves = [](const std::vector<float>& of) { return bf16_rows(of, 1, 1); };
+        return trial.run<std::uint16_t>(how, y_is_bf16, halves, in_cluster);
+      };
+      const std::vector<float> wide = run(false, false), narrow = run(true, false);
+      CHECK(error(wide, trial.expected()) < 4e-3);
+      in_two_schedules(static_cast<std::size_t>((&c - kClusterCases) + (&shape - kAttentionShapes)), [&] {
+        CHECK(run(false, true) == wide);
+        CHECK(run(true, true) == narrow);
+      });
+      ++n_run;
+    }
+    CHECK((n_run > 0) == (shape.in_cluster != nullptr));
   }
   CHECK(counts.bank_conflicts == 0);
 }

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The mistakes in tiles for Hopper, for mistakes.py, which says what the four texts of each are."""
+"""The mistakes in kernels for Hopper alone, for mistakes.py, which says what the four texts of each are."""
 
 HOPPER_MISTAKES = {
     "no fence before wgmma reads copies": (
@@ -324,5 +324,71 @@ HOPPER_MISTAKES = {
         "hopper_linear_bf16",
         "job.partial ? job.n_row_x() : job.n_row",
         "job.n_row",
+    ),
+    "no barrier of the cluster before shares of the keys are combined": (
+        "hopper_attention.cu",
+        "hopper_attention",
+        "  dev::meet_cluster();  // sums",
+        "  __syncthreads();  // sums",
+    ),
+    "a block of attention ends while its sums are read": (
+        "hopper_attention.cu",
+        "hopper_attention",
+        "  dev::leave_cluster();",
+        "",
+    ),
+    "sums of values of the first share for each": (
+        "hopper_attention.cu",
+        "hopper_attention",
+        "sums + column * 4, z)",
+        "sums + column * 4, 0)",
+    ),
+    "a share is weighed as the next one": (
+        "hopper_attention.cu",
+        "hopper_attention",
+        "sums + S::kDepth * 4, lane)",
+        "sums + S::kDepth * 4, (lane + 1) % job.n_split)",
+    ),
+    "the last share of the keys is left out": (
+        "hopper_attention.cu",
+        "hopper_attention",
+        "z < job.n_split && column",
+        "z < job.n_split - 1 && column",
+    ),
+    "each block combines the first one's parts of rows": (
+        "hopper_attention.cu",
+        "hopper_attention",
+        "int part = static_cast<int>(blockIdx.z) + ",
+        "int part = ",
+    ),
+    "rows behind the last are combined": (
+        "hopper_attention.cu",
+        "hopper_attention",
+        "(job.n_row() - row0 < S::kRows ? job.n_row() - row0 : S::kRows) * kParts",
+        "S::kRows * kParts",
+    ),
+    "columns behind the last of a head": (
+        "hopper_attention.cu",
+        "hopper_attention",
+        "  if (column >= job.d_head) return;\n",
+        "",
+    ),
+    "a share's largest score is not scaled": (
+        "attention_tile.h",
+        "hopper_attention",
+        "float2{most_[h] * (job_.scale * kLog2), total_[h]}",
+        "float2{most_[h], total_[h]}",
+    ),
+    "sums of weights are added without rescaling": (
+        "attention_rows.h",
+        "hopper_attention",
+        "sum_of_warp(total * most)",
+        "sum_of_warp(total)",
+    ),
+    "sums of a cluster without padding, which is slow": (
+        "attention.h",
+        "hopper_attention",
+        "depth * 4 + 32",
+        "depth * 4 + 16",
     ),
 }

@@ -8,11 +8,13 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <functional>
 
 #include "cuda/fake_driver.h"
 #include "cuda/machine.h"
 #include "devices/devices.h"
 #include "lower/cuda/cuda_device.h"
+#include "lower/lower_case.h"
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
 
@@ -72,6 +74,28 @@ double norm_of_difference(const std::vector<float>& a, const std::vector<float>&
   return largest ? most : std::sqrt(squares / static_cast<double>(a.size()));
 }
 
+/// Acts with products of bf16. The chunk is nearer to the float32 reference than PyTorch's in bf16, by both norms.
+/// Tensor cores are emulated with sums in float32, one product after the other.
+void check_nearer_than_bf16(const std::string& path) {
+  CAPTURE(path);
+  const GoldenCase golden = GoldenCase::read(path);
+  const auto engine = load_engine(golden.bundle(), "chunk");
+  const ActionChunk chunk = act(*engine, golden);
+  const auto expected = golden.expected();
+  const auto &reference = find_tap(expected, "chunk").values, &bf16 = find_tap(expected, "chunk.bf16").values;
+  const auto& ours = find_tap(chunk.taps, "chunk").values;
+  MESSAGE(path, ": ", engine->device().linear_kernels());
+  for (const bool largest : {false, true}) {
+    MESSAGE(norm_of_difference(ours, reference, largest), " of ", norm_of_difference(bf16, reference, largest));
+    CHECK(norm_of_difference(ours, reference, largest) <= norm_of_difference(bf16, reference, largest));
+  }
+}
+
+bool attended_in_cluster() {
+  return std::ranges::any_of(test::cuda::fake_driver().in_clusters,
+                             [](const std::string& kernel) { return kernel.starts_with("hopper_attention"); });
+}
+
 }  // namespace
 
 TEST_CASE("policies on our own kernels for CUDA match the reference at every tap within 1e-4") {
@@ -91,33 +115,72 @@ TEST_CASE("policies on our own kernels for CUDA match the reference at every tap
   }
 }
 
-// Tensor cores are emulated with sums in float32, one product after the other.
 TEST_CASE("products of bf16 give a chunk nearer to the float32 reference than PyTorch's bf16, by both norms") {
   for (const std::string& path : cases()) {
-    CAPTURE(path);
     test::cuda::reset_fake_driver();
-    const GoldenCase golden = GoldenCase::read(path);
-    const auto engine = load_engine(golden.bundle(), "chunk");
-    const ActionChunk chunk = act(*engine, golden);
-    const auto expected = golden.expected();
-    const auto &reference = find_tap(expected, "chunk").values, &bf16 = find_tap(expected, "chunk.bf16").values;
-    const auto& ours = find_tap(chunk.taps, "chunk").values;
-    MESSAGE(path, ": ", engine->device().linear_kernels());
-    for (const bool largest : {false, true}) {
-      MESSAGE(norm_of_difference(ours, reference, largest), " of ", norm_of_difference(bf16, reference, largest));
-      CHECK(norm_of_difference(ours, reference, largest) <= norm_of_difference(bf16, reference, largest));
-    }
+    check_nearer_than_bf16(path);
   }
+}
+
+TEST_CASE("so they do where attention takes clusters, as it does on as many SMs as an H200 has") {
+  const auto has_many_keys = [](const std::string& path) { return path.ends_with("/vla_adapter/spatial"); };
+  std::vector<std::string> paths = cases();
+  std::erase_if(paths, std::not_fn(has_many_keys));
+  if (paths.empty()) MESSAGE("skipped: VLA_ALL_FAMILIES has the case");
+  for (const std::string& path : paths) {
+    test::cuda::reset_fake_driver();
+    test::cuda::fake_driver().n_sm = 132;
+    check_nearer_than_bf16(path);
+    CHECK(attended_in_cluster());
+  }
+  test::cuda::reset_fake_driver();
 }
 
 TEST_CASE("attention of few queries fills a device, and of many takes the keys one tile after the other") {
   const auto blocks = [](std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm) {
-    const lower::AttentionPlan plan = lower::plan_attention(d_head, n_row, n_unit, n_key, n_sm);
+    const lower::AttentionPlan plan = lower::plan_attention(d_head, n_row, n_unit, n_key, n_sm, false);
     CHECK(plan.shape->depth >= d_head);
     CHECK(plan.n_split <= vla::cuda::kMaxAttentionSplit);
     return (n_row + plan.shape->rows - 1) / plan.shape->rows * n_unit * plan.n_split;
   };
   CHECK(blocks(72, 16, 1, 1 << 16, 132) >= 8);
+}
+
+TEST_CASE("a cluster combines the shares of attention on Hopper alone, and where that is estimated to be faster") {
+  int n_cluster = 0;
+  for (const std::int64_t d_head : {64, 128, 256})
+    for (const std::int64_t n_row : {16, 400, 4000})
+      for (const std::int64_t n_key : {60, 300, 1200, 5000}) {
+        const lower::AttentionPlan elsewhere = lower::plan_attention(d_head, n_row, 1, n_key, 132, false),
+                                   hopper = lower::plan_attention(d_head, n_row, 1, n_key, 132, true);
+        INFO(n_row, " rows, heads of ", d_head, ", ", n_key, " keys: ", hopper.shape->kernel, ", ", hopper.n_split);
+        CHECK(!elsewhere.in_cluster);
+        CHECK(hopper.in_cluster == (hopper.us < elsewhere.us));
+        CHECK((!hopper.in_cluster || hopper.shape->fits_cluster(hopper.n_split)));
+        n_cluster += hopper.in_cluster ? 1 : 0;
+      }
+  CHECK(n_cluster > 0);
+  CHECK(n_cluster < 36);
+}
+
+TEST_CASE("a graph's attention in a cluster is a launch less, and as near to the reference") {
+  const LowerParams params(DType::bf16);  // attention reads bf16 where matrices are bf16
+  const auto attend = [](GraphRunner& r, const LowerParams&) {
+    const Tensor k = input(r, {256, 1, 300, 1}), v = input(r, {256, 1, 300, 1}, 2);
+    return attention(r.graph, input(r, {256, 8, 5, 1}), {{k, v}}, {});
+  };
+  const std::vector<float> expected = result_of("ggml", params, attend);
+  long n_launch[2] = {};
+  for (const int major : {9, 8}) {
+    if (major == 8 && test::cuda::runs_ptx()) continue;  // of Hopper alone
+    test::cuda::reset_fake_driver();
+    test::cuda::fake_driver().major = major, test::cuda::fake_driver().n_sm = 132;
+    check_close(result_of("", params, attend), expected, 4e-3);
+    CHECK(attended_in_cluster() == (major == 9));
+    n_launch[9 - major] = test::cuda::fake_driver().n_call["cuLaunchKernelEx"];
+  }
+  if (!test::cuda::runs_ptx()) CHECK(n_launch[0] == n_launch[1] - 1);
+  test::cuda::reset_fake_driver();
 }
 
 TEST_CASE("attention takes the shape and the shares that were fastest on an H200, or within a tenth of it") {
@@ -139,7 +202,8 @@ TEST_CASE("attention takes the shape and the shares that were fastest on an H200
       {128, 2568, 5, 642, {{"attention_bf16_128", 1}}},                                   // BitVLA, language
   };
   for (const Size& size : sizes) {
-    const lower::AttentionPlan plan = lower::plan_attention(size.d_head, size.n_row, size.n_unit, size.n_key, 132);
+    const lower::AttentionPlan plan =
+        lower::plan_attention(size.d_head, size.n_row, size.n_unit, size.n_key, 132, false);
     INFO(size.d_head, " of a head, ", size.n_key, " keys: ", plan.shape->kernel, ", shares ", plan.n_split);
     CHECK(std::find(size.fast.begin(), size.fast.end(),
                     std::pair<std::string, int>(plan.shape->kernel, plan.n_split)) != size.fast.end());

@@ -88,7 +88,7 @@ def test_no_kernel_of_any_architecture_spills(machine_code):
 def test_tiles_for_hopper_fit_it_and_their_products_do_not_wait_for_each_other(machine_code):
     if not cuda_kernels.tool("nvdisasm"):
         pytest.skip("no nvdisasm: it is beside the nvcc that `make test` downloads")
-    kernels = {name: code for (_, name), code in machine_code.items() if name.startswith("hopper_")}
+    kernels = {name: code for (_, name), code in machine_code.items() if name.startswith("hopper_linear")}
     assert len(kernels) > 40
     for name, (used, loop) in kernels.items():
         kind, columns, rows = re.match(r"hopper_linears?_([a-z0-9]+)_(\d+)x(\d+)", name).groups()
@@ -109,8 +109,8 @@ def test_main_loops_have_the_tensor_instructions_that_they_need(machine_code):
         pytest.skip("no nvdisasm: it is beside the nvcc that `make test` downloads")
     for (sm, name), (_, loop) in machine_code.items():
         tensor = {op: n for op, n in loop.items() if op.startswith(cuda_kernels.TENSOR)}
-        if not name.startswith("hopper_"):
-            expected = MAIN_LOOPS.get(name) or STRIP_LOOPS.get(name)
+        if not name.startswith("hopper_linear"):
+            expected = MAIN_LOOPS.get(name.removeprefix("hopper_")) or STRIP_LOOPS.get(name)
             assert tensor == (dict([expected]) if expected else {}), (sm, name)
 
 

@@ -27,7 +27,8 @@ struct AttentionJob {
   void* y;            // [d_head, n_head, n_query, n_batch], float32 or bf16
   /// With more than one split, at most kMaxAttentionSplit, each split takes a share of the keys. It writes each row's
   /// sums of values, largest score and sum of weights to partial [d_head + 2, n_row, n_head_kv * n_batch, n_split];
-  /// `finish_attention` computes y from them.
+  /// `finish_attention` computes y from them. Null: the splits of the same rows, at most kMaxCluster, are a cluster,
+  /// which combines them itself; only on Hopper, in a shape with such a kernel.
   float* partial;
   float scale;
   int n_segment, n_query, n_head, n_head_kv, n_batch, d_head, n_split;
@@ -48,12 +49,20 @@ struct AttentionShape {
   const char* kernel;
   int depth;  // the largest d_head
   int rows, key_groups, keys;
+  const char* in_cluster = nullptr;  // the kernel for Hopper whose clusters combine shares of the keys, or null
 
   constexpr int n_thread() const { return rows / 16 * key_groups * 32; }
   /// Bytes of a row of queries, keys or values in shared memory, and of weights. They are padded by 16 bytes, so that
   /// the eight rows of a matrix load are in different banks.
   constexpr int row() const { return depth * 2 + 16; }
   constexpr int weight_row() const { return keys * 2 + 16; }
+  /// Bytes of a row that a block leaves to its cluster, in the place of queries, keys and values: sums of values,
+  /// largest score, sum of weights. The padding puts the four rows that half a warp writes in different banks.
+  constexpr int sums_row() const { return depth * 4 + 32; }
+  /// Whether a cluster can combine so many shares of the keys.
+  constexpr bool fits_cluster(std::int64_t n_split) const {
+    return in_cluster != nullptr && n_split > 1 && n_split <= kMaxCluster;
+  }
   constexpr int stages() const { return key_groups == 1 ? 2 : 1; }
   constexpr int shared() const {
     const int exchanged = key_groups == 1 ? 0 : rows * (weight_row() + 4 * key_groups);
@@ -61,21 +70,27 @@ struct AttentionShape {
   }
 };
 constexpr AttentionShape kAttentionShapes[] = {
-    {"attention_bf16_64", 64, 64, 1, 64},       {"attention_bf16_64_32", 64, 32, 4, 256},
-    {"attention_bf16_64_16", 64, 16, 8, 256},   {"attention_bf16_80", 80, 64, 1, 64},
-    {"attention_bf16_128", 128, 64, 1, 64},     {"attention_bf16_128_32", 128, 32, 4, 128},
-    {"attention_bf16_128_16", 128, 16, 8, 128}, {"attention_bf16_256", 256, 64, 2, 32},
-    {"attention_bf16_256_32", 256, 32, 4, 64},
+    {"attention_bf16_64", 64, 64, 1, 64},
+    {"attention_bf16_64_32", 64, 32, 4, 256, "hopper_attention_bf16_64_32"},
+    {"attention_bf16_64_16", 64, 16, 8, 256, "hopper_attention_bf16_64_16"},
+    {"attention_bf16_80", 80, 64, 1, 64},
+    {"attention_bf16_128", 128, 64, 1, 64},
+    {"attention_bf16_128_32", 128, 32, 4, 128, "hopper_attention_bf16_128_32"},
+    {"attention_bf16_128_16", 128, 16, 8, 128, "hopper_attention_bf16_128_16"},
+    {"attention_bf16_256", 256, 64, 2, 32},
+    {"attention_bf16_256_32", 256, 32, 4, 64, "hopper_attention_bf16_256_32"},
 };
 
 /// On tensor cores: q, k and v are bf16; d_head, at most shape.depth, and all strides are multiples of 8. Weights are
 /// rounded to bf16, sums and softmax are float32.
 inline Launch attention_bf16(const AttentionShape& shape, const AttentionJob& job) {
-  return {shape.kernel,
+  const unsigned cluster = cluster_of(job);
+  return {cluster > 1 ? shape.in_cluster : shape.kernel,
           {blocks(job.n_row(), shape.rows), static_cast<unsigned>(job.n_head_kv * job.n_batch),
            static_cast<unsigned>(job.n_split)},
           static_cast<unsigned>(shape.n_thread()),
-          static_cast<unsigned>(shape.shared())};
+          static_cast<unsigned>(shape.shared()),
+          cluster};
 }
 /// In float32, for any d_head.
 inline Launch attention_f32(const AttentionJob& job) {

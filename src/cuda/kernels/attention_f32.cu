@@ -7,7 +7,6 @@ namespace {
 
 /// The factor that rescales the sums when the largest score grows.
 VLA_DEVICE float shrink(float before, float after) { return dev::power_of_two(before - finite(after)); }
-VLA_DEVICE float weight_of(float score, float most) { return dev::power_of_two(score - finite(most)); }
 VLA_DEVICE void store_y(const AttentionJob& job, const Unit& unit, int row, int i, float value) {
   store(job.y, job.is_bf16, y_row(job, unit, row) + i, value);
 }
@@ -116,8 +115,9 @@ VLA_KERNEL(attention_finish, 128, 4, AttentionJob) {
   const int i = warp % n_part * 64 + lane;
   const std::int64_t stride = partial_row(job, row, 1) - partial_row(job, row, 0);
   const float* partial = partial_row(job, row, 0);
-  float most = kMinusInfinity, total = 0, sums[2] = {};
-  if (lane < job.n_split) most = partial[lane * stride + job.d_head], total = partial[lane * stride + job.d_head + 1];
+  float sums[2] = {};
+  RowShares shares = {kMinusInfinity, 0};
+  if (lane < job.n_split) shares = {partial[lane * stride + job.d_head], partial[lane * stride + job.d_head + 1]};
   for (int first = 0; first < job.n_split; first += kAtOnce) {
     float values[kAtOnce][2];
 #pragma unroll
@@ -126,21 +126,12 @@ VLA_KERNEL(attention_finish, 128, 4, AttentionJob) {
       for (int j = 0; j < 2; ++j)
         values[z][j] =
             first + z < job.n_split && i + j * 32 < job.d_head ? partial[(first + z) * stride + i + j * 32] : 0;
-    if (first == 0) {
-      float all = most;
-      for (int mask = 16; mask > 0; mask /= 2) all = fmaxf(all, dev::shuffle_xor(all, mask));
-      most = weight_of(most, all), total = sum_of_warp(total * most);  // most: the share's weight from here on
-    }
-#pragma unroll
-    for (int z = 0; z < kAtOnce; ++z) {
-      const float weight = dev::shuffle(most, first + z);
-#pragma unroll
-      for (int j = 0; j < 2; ++j) sums[j] += values[z][j] * weight;
-    }
+    if (first == 0) shares.weigh();
+    shares.add(first, values, sums);
   }
 #pragma unroll
   for (int j = 0; j < 2; ++j)
-    if (i + j * 32 < job.d_head) store_y(job, unit, row, i + j * 32, sums[j] / total);
+    if (i + j * 32 < job.d_head) store_y(job, unit, row, i + j * 32, sums[j] / shares.total);
 }
 
 }  // namespace vla::cuda

@@ -37,6 +37,32 @@ VLA_DEVICE int count_keys(const AttentionJob& job) {
 /// weights are zero.
 VLA_DEVICE float finite(float most) { return most == kMinusInfinity ? 0 : most; }
 
+/// A score's weight where the largest score is `most`.
+VLA_DEVICE float weight_of(float score, float most) { return dev::power_of_two(score - finite(most)); }
+
+/// How a warp combines shares of a row's keys. Lane z has the largest score of share z and its sum of weights; a lane
+/// without a share has minus infinity and zero.
+struct RowShares {
+  float most, total;
+
+  /// To be called once. Replaces `most` by the share's weight, and `total` by the sum of weights of all shares.
+  VLA_DEVICE void weigh() {
+    float all = most;
+    for (int mask = 16; mask > 0; mask /= 2) all = fmaxf(all, dev::shuffle_xor(all, mask));
+    most = weight_of(most, all), total = sum_of_warp(total * most);
+  }
+  /// Adds the weighted values of shares `first` to first + kCount - 1.
+  template <int kCount, int kEach>
+  VLA_DEVICE void add(int first, const float (&values)[kCount][kEach], float (&sums)[kEach]) const {
+#pragma unroll
+    for (int z = 0; z < kCount; ++z) {
+      const float weight = dev::shuffle(most, first + z);
+#pragma unroll
+      for (int j = 0; j < kEach; ++j) sums[j] += values[z][j] * weight;
+    }
+  }
+};
+
 VLA_DEVICE float* partial_row(const AttentionJob& job, int row, int split) {
   const std::int64_t unit = static_cast<std::int64_t>(split) * job.n_head_kv * job.n_batch + blockIdx.y;
   return job.partial + (unit * job.n_row() + row) * (job.d_head + 2);

@@ -40,7 +40,8 @@ struct HopperSplit {
 };
 constexpr HopperSplit kHopperSplits[] = {{1, false}, {2, false}, {2, true}, {3, false}, {3, true}, {4, false},
                                          {4, true},  {6, false}, {6, true}, {8, false}, {8, true}};
-/// The cluster of a product in Hopper's tiles: its shares of the depth, unless they go to partial sums.
+/// The cluster of a product in Hopper's tiles or of attention: its shares of the depth or of the keys, unless they go
+/// to partial sums.
 template <class Job>
 unsigned cluster_of(const Job& job) {
   return job.partial != nullptr ? 1 : static_cast<unsigned>(job.n_split);

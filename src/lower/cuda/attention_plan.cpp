@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <numeric>
 
+#include "lower/cuda/cluster_cost.h"
 #include "lower/cuda/cuda_lowering.h"
 
 namespace vla::lower {
@@ -22,32 +23,44 @@ constexpr double kStart = 2.9, kCombine = 2.7;
 /// Bytes of partial sums that one SM moves per microsecond.
 constexpr double kPartial = 12.4e3;
 
-double microseconds(const cuda::AttentionShape& shape, std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit,
-                    std::int64_t n_key, std::int64_t n_split, int n_sm) {
+/// What attention computes, as plan_attention is told it.
+struct AttentionSize {
+  std::int64_t d_head, n_row, n_unit, n_key;
+};
+
+/// The estimated time of a plan's shape and shares.
+double microseconds(const AttentionPlan& plan, const AttentionSize& size, int n_sm) {
+  const auto& [d_head, n_row, n_unit, n_key] = size;
+  const cuda::AttentionShape& shape = *plan.shape;
   const AttentionRates& rates = shape.key_groups > 1 ? kSharedKeys : kOneGroup;
-  const std::int64_t n_block = ceil_div(n_row, shape.rows) * n_unit * n_split;
-  const std::int64_t share = ceil_div(n_key, n_split), n_tile = ceil_div(share, shape.keys);
+  const std::int64_t n_block = ceil_div(n_row, shape.rows) * n_unit * plan.n_split;
+  const std::int64_t share = ceil_div(n_key, plan.n_split), n_tile = ceil_div(share, shape.keys);
   const double products = static_cast<double>(shape.rows) * shape.keys * shape.depth;
-  const double block = static_cast<double>(n_tile) * (rates.tile + products / rates.products);
-  const double each = 1 + rates.further * static_cast<double>(ceil_div(n_block, n_sm) - 1);
-  const double finish =
-      n_split == 1 ? 0
-                   : kCombine + 8.0 * static_cast<double>((d_head + 2) * n_row * n_unit * n_split) / (kPartial * n_sm);
-  return kStart + each * block + finish;
+  double block = static_cast<double>(n_tile) * (rates.tile + products / rates.products);
+  if (plan.in_cluster)
+    block += combine_us(static_cast<double>((d_head + 2) * std::min<std::int64_t>(shape.rows, n_row)), plan.n_split);
+  const int n_usable = plan.in_cluster ? usable_sms(n_sm, plan.n_split) : n_sm;
+  const double each = 1 + rates.further * static_cast<double>(ceil_div(n_block, n_usable) - 1);
+  const double us = kStart + each * block;
+  if (plan.n_split == 1 || plan.in_cluster) return us;
+  return us + kCombine + 8.0 * static_cast<double>((d_head + 2) * n_row * n_unit * plan.n_split) / (kPartial * n_sm);
 }
 
 }  // namespace
 
-AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key,
-                             int n_sm) {
+AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm,
+                             bool is_hopper) {
   AttentionPlan best;
   for (const cuda::AttentionShape& shape : cuda::kAttentionShapes) {
     if (shape.depth < d_head || (best.shape != nullptr && shape.depth > best.shape->depth)) continue;
     const std::int64_t most = std::min<std::int64_t>(ceil_div(n_key, 64), cuda::kMaxAttentionSplit);
-    for (std::int64_t n_split = 1; n_split <= std::max<std::int64_t>(most, 1); ++n_split) {
-      const double time = microseconds(shape, d_head, n_row, n_unit, n_key, n_split, n_sm);
-      if (best.shape == nullptr || time < best.us) best = {&shape, static_cast<int>(n_split), time};
-    }
+    for (std::int64_t n_split = 1; n_split <= std::max<std::int64_t>(most, 1); ++n_split)
+      for (const bool in_cluster : {false, true}) {
+        if (in_cluster && !(is_hopper && shape.fits_cluster(n_split))) continue;
+        AttentionPlan plan = {&shape, static_cast<int>(n_split), in_cluster};
+        plan.us = microseconds(plan, {d_head, n_row, n_unit, n_key}, n_sm);
+        if (best.shape == nullptr || plan.us < best.us) best = plan;
+      }
   }
   return best;
 }
@@ -56,7 +69,7 @@ AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op) {
   const std::int64_t n_key = std::accumulate(op.n_key.begin(), op.n_key.end(), std::int64_t{0});
   if (op.rounds) {
     const std::int64_t n_head_kv = l.value(op.packed[0]).shape[1];
-    return plan_attention(q[0], q[1] / n_head_kv * q[2], n_head_kv * q[3], n_key, l.n_sm);
+    return plan_attention(q[0], q[1] / n_head_kv * q[2], n_head_kv * q[3], n_key, l.n_sm, l.is_hopper);
   }
   const std::int64_t n_block = q[1] * q[3] * ceil_div(q[2], 8);  // a lower bound
   const std::int64_t most = std::min<std::int64_t>(ceil_div(n_key, 128), cuda::kMaxAttentionSplit);

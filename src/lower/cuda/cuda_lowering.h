@@ -38,6 +38,7 @@ struct ProductCut {
 struct AttentionPlan {
   const cuda::AttentionShape* shape = nullptr;  // null: no tensor cores
   int n_split = 1;                              // shares of the keys, each with its own blocks
+  bool in_cluster = false;                      // of Hopper: a cluster's blocks combine the shares
   double us = 0;                                // estimated time on Hopper, on tensor cores
 };
 
@@ -135,8 +136,8 @@ double us_with_norm(const ProductCut& cut);
 
 /// The tensor-core plan with the shortest estimated time. n_row: query rows per key head. n_unit: key heads of the
 /// whole batch.
-AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key,
-                             int n_sm);
+AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm,
+                             bool is_hopper);
 AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op);
 
 /// FLOP and bytes, see Program::work.

@@ -5,6 +5,7 @@
 
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/kernels/linear_int8.h"
+#include "lower/cuda/cluster_cost.h"
 #include "lower/cuda/cuda_lowering.h"
 
 namespace vla::lower {
@@ -51,15 +52,6 @@ constexpr ProductRates kInt8 = {.sums = 51.6e3,
                                 .share = 3.5e-5,
                                 .further = 1.18};
 constexpr double kWritten = 2.5e6;  // bytes that all SMs together write to memory per microsecond
-// Clusters, whose blocks add shares. All three are assumed and not measured.
-constexpr double kCluster = 1.2;    // microseconds of both barriers and of the first read of another block
-constexpr double kOfOthers = 20e3;  // bytes that an SM reads from other blocks' shared memory per microsecond
-constexpr int kGroupOfSms = 16;     // a cluster's SMs are of one such group
-/// SMs that clusters of this many blocks can keep busy.
-int usable_sms(int n_sm, int n_block) {
-  const int n = n_sm / kGroupOfSms * (kGroupOfSms / n_block * n_block) + n_sm % kGroupOfSms / n_block * n_block;
-  return std::max(n, n_block);
-}
 
 /// A tile of a table, and the bytes that it reads per step of 128 bytes of depth.
 struct Candidate {
@@ -117,8 +109,7 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
         of_block += rates.first_end + rates.end * n_finished;
       else
         of_block += rates.share * size;
-      const double n_read = static_cast<double>(tile.columns) * n_used / n_split * (n_split - 1);  // of other blocks
-      if (in_cluster) of_block += kCluster + 4 * n_read / kOfOthers;
+      if (in_cluster) of_block += combine_us(static_cast<double>(tile.columns) * n_used, n_split);
       const int n_usable = in_cluster ? usable_sms(n_sm, n_split) : n_sm;
       const auto n_wave = static_cast<double>(ceil_div(n_whole * n_split, n_usable));
       double us = rates.kernel + of_block * (1 + rates.further * (n_wave - 1));

@@ -235,7 +235,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
     const AttentionPlan plan = plan_attention(l, op);
     CudaOp& made = add_op(std::move(step), std::move(op));
     made.plan = plan;
-    split(made, plan.n_split, (q[0] + 2) * q[1] * q[2] * q[3]);
+    if (!plan.in_cluster) split(made, plan.n_split, (q[0] + 2) * q[1] * q[2] * q[3]);
   }
 
   std::map<ValueId, std::pair<ValueId, ValueId>> keys_;

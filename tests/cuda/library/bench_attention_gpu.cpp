@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Times attention of full-size policies in every shape of blocks and split of the keys on the first GPU, one JSON
-// object a line: `us` of an attention with what combines its shares, `blocks_us` without. On the driver of tests the
-// times say nothing.
+// Times attention of full-size policies in every shape of blocks and split of the keys on the first GPU, on Hopper also
+// in clusters, one JSON object a line: `us` of an attention with what combines its shares, `blocks_us` without a kernel
+// that does. On the driver of tests the times say nothing.
 #include <fmt/format.h>
 
 #include <cmath>
@@ -97,14 +97,21 @@ class Bench {
       job.n_split = n_split;
       if (!is_bf16) VLA_CHECK(tell(size, job, attention_f32(job)));
       for (const AttentionShape& shape : kAttentionShapes)
-        if (is_bf16 && shape.depth == depth) VLA_CHECK(tell(size, job, attention_bf16(shape, job)));
+        if (is_bf16 && shape.depth == depth) VLA_CHECK(run_shape(size, job, shape));
     }
     return {};
+  }
+  /// Both ways to combine shares, if the device has clusters.
+  Status run_shape(const Size& size, AttentionJob job, const AttentionShape& shape) {
+    VLA_CHECK(tell(size, job, attention_bf16(shape, job)));
+    if (!timer_.gpu().is_hopper() || !shape.fits_cluster(job.n_split)) return {};
+    job.partial = nullptr;
+    return tell(size, job, attention_bf16(shape, job));
   }
 
   Status tell(const Size& size, const AttentionJob& job, const Launch& how) {
     const Launch launches[] = {how, finish_attention(job)};
-    const std::span<const Launch> all(launches, job.n_split > 1 ? 2 : 1);
+    const std::span<const Launch> all(launches, job.n_split > 1 && job.partial != nullptr ? 2 : 1);
     VLA_TRY(const float us, timer_.time(std::span(&job, 1), all));
     VLA_TRY(const float of_blocks, timer_.time(std::span(&job, 1), all.first(1)));
     fmt::print(

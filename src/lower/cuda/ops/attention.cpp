@@ -31,7 +31,7 @@ Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const AttentionO
   job.n_split = op.plan.n_split, job.partial = l.at(op.partial),
   job.is_bf16 = l.value(op.writes[0]).type == DType::bf16;
   Calls calls = {call(attention.rounds ? cuda::attention_bf16(*op.plan.shape, job) : cuda::attention_f32(job), job)};
-  if (job.n_split > 1) calls.push_back(call(cuda::finish_attention(job), job));
+  if (job.partial != nullptr) calls.push_back(call(cuda::finish_attention(job), job));
   return calls;
 }
 
