@@ -41,7 +41,7 @@ void check_begun(const ProductCase& c, const Beginner& kernel, const BegunNorm& 
   const Operands of(c, true);
   const std::int64_t stride = round_up(c.depth, 8), of_rows = round_up(c.n_column, 2) + 2;
   const int part = kernel.width == 0 ? 64 : norm_part(kernel.width), n_part = (c.n_column + part - 1) / part;
-  const int n_more = (norm.is_layer ? 1 : 0) + (norm.has_bias ? 1 : 0);
+  const int n_more = (norm.is_layer ? 2 : 0) + (norm.has_bias ? 2 : 0);
   Numbers numbers;
   const std::vector<float> weight = numbers.floats(c.n_column), bias = numbers.floats(c.n_column);
   const Device<std::uint16_t> rows(
@@ -66,7 +66,8 @@ void check_begun(const ProductCase& c, const Beginner& kernel, const BegunNorm& 
   const auto expected_row = [&](int row, std::size_t i) {
     const float scale = norm.has_weight ? weight[i] : 1;
     if (row < c.n_row) return y[static_cast<std::size_t>(row * c.n_column) + i] * scale;
-    return norm.is_layer && row == c.n_row ? scale : bias[i];
+    const float value = norm.is_layer && row < c.n_row + 2 ? scale : bias[i];
+    return (row - c.n_row) % 2 == 0 ? value : value - from_bf16(to_bf16(value));
   };
   bool are_rounded = true;
   for (int row = 0; row < c.n_row + n_more; ++row)
@@ -165,7 +166,8 @@ void check_shifted(const EndedCase& c) {
   constexpr int kRows = 41, kColumns = 96, kDepth = 520, kPart = 64, kParts = (kDepth + kPart - 1) / kPart, kHead = 32;
   constexpr float kEps = 0.25f;
   Numbers numbers;
-  const std::vector<float> x = rounded_to_bf16(numbers.floats((kRows + 2) * kDepth));  // and a weight's and a bias' row
+  const std::vector<float> x =
+      rounded_to_bf16(numbers.floats((kRows + 4) * kDepth));  // and a weight's and a bias' rows
   const std::vector<float> squares = numbers.floats(kParts * kRows), sums = numbers.floats(kParts * kRows, 9);
   std::vector<float> positive = squares;
   for (float& one : positive) one = 30 * std::fabs(one) + 1;
@@ -175,7 +177,7 @@ void check_shifted(const EndedCase& c) {
   const Device<std::uint16_t> rows(bf16_rows(x, kDepth, kDepth)), of_y(bf16_rows(weight, kDepth, kDepth)),
       of_gate(bf16_rows(gate, kDepth, kDepth));
   const Device<float> all_squares(positive), all_sums(sums), all_bias(bias), turns(table),
-      partial(static_cast<std::size_t>(2 * c.n_split * (kRows + 2) * kColumns));
+      partial(static_cast<std::size_t>(2 * c.n_split * (kRows + 4) * kColumns));
   const auto product = [&](const std::vector<float>& matrix, int row, int column) {
     double sum = 0;
     for (int k = 0; k < kDepth; ++k)
@@ -194,8 +196,8 @@ void check_shifted(const EndedCase& c) {
         all += static_cast<double>(positive[at(part)]) + n * off * off;
       }
       const double factor = 1 / std::sqrt(all / kDepth + static_cast<double>(kEps));
-      return factor * (product(matrix, row, column) - mean * product(matrix, kRows, column)) +
-             product(matrix, is_layer ? kRows + 1 : kRows, column) +
+      const auto both = [&](int first) { return product(matrix, first, column) + product(matrix, first + 1, column); };
+      return factor * (product(matrix, row, column) - mean * both(kRows)) + both(is_layer ? kRows + 2 : kRows) +
              static_cast<double>(bias[static_cast<std::size_t>(column)]);
     };
     std::vector<double> expected;

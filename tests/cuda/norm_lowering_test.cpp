@@ -53,7 +53,7 @@ void check(const Build& build, int n_begun, int n_operation) {
 }  // namespace
 
 TEST_CASE("a product begins the norm that only bf16 products read, and those end it") {
-  for (const int n_row : {kRows, 62})
+  for (const int n_row : {kRows, 60})
     for (const Norm& norm : {Norm{op::NormKind::layer}, Norm{op::NormKind::layer, true}, Norm{op::NormKind::rms, true}})
       check([=](GraphRunner& r,
                 const LowerParams& p) { return two_products(r, p, normed(r, p, first_product(r, p, n_row), norm)); },
@@ -109,7 +109,7 @@ TEST_CASE("ways to lower a graph that VLA_CUDA_WITHOUT names are not used, and t
 TEST_CASE("a norm that a product's kernels cannot begin, or its readers not end, is an operation") {
   check(
       [](GraphRunner& r, const LowerParams& p) {  // rows, and those of a weight and a bias, of more than a block
-        return two_products(r, p, normed(r, p, first_product(r, p, 63), {op::NormKind::layer, true}));
+        return two_products(r, p, normed(r, p, first_product(r, p, 61), {op::NormKind::layer, true}));
       },
       0, 1);
   check(

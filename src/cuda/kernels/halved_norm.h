@@ -47,8 +47,16 @@ struct NormedColumns {
   template <class SumsOf>
   VLA_DEVICE void load(const LinearBf16Job& job, SumsOf sums_of) {
     const bool has_mean = job.norm_end.moments.sums != nullptr;
-    if (has_mean) sums_of(job.n_row, weight);
-    if (job.norm_end.has_bias) sums_of(job.n_row + (has_mean ? 1 : 0), bias);
+    if (has_mean) add_rows(job.n_row, sums_of, weight);
+    if (job.norm_end.has_bias) add_rows(job.n_row + (has_mean ? 2 : 0), sums_of, bias);
+  }
+  /// The sums of two rows, of which the second has what the first one's rounding took.
+  template <class SumsOf>
+  static VLA_DEVICE void add_rows(int row, SumsOf sums_of, float (&to)[kCount]) {
+    float rest[kCount];
+    sums_of(row, to), sums_of(row + 1, rest);
+#pragma unroll
+    for (int c = 0; c < kCount; ++c) to[c] += rest[c];
   }
   /// The norm's product, from a sum of column c.
   VLA_DEVICE float normed(const RowTerms& row, float sum, int c) const {
@@ -77,6 +85,16 @@ VLA_DEVICE void store_begun(const LinearBf16Job& job, int row, int column, Value
   }
 }
 
+/// Stores values rounded, and in the next row what they lack then.
+template <int kCount, class Value>
+VLA_DEVICE void store_twice(const LinearBf16Job& job, int row, int column, Value value) {
+  store_begun<kCount>(job, row, column, value);
+  store_begun<kCount>(job, row + 1, column, [&](int c) {
+    const float of = value(c);
+    return of - dev::float_of(static_cast<int>(dev::to_bf16(of, 0) << 16));
+  });
+}
+
 /// Begins the norm of a row of y, which has kCount adjacent columns from `column` on in each of kLanesOfPart lanes. All
 /// lanes of the warp must call it, also those of rows and columns after the last.
 template <int kLanesOfPart, int kCount>
@@ -103,9 +121,9 @@ VLA_DEVICE void begin_norm(const LinearBf16Job& job, int row, int column, const 
   const auto weight_of = [&](int c) { return norm.weight ? norm.weight[c] : 1; };
   store_begun<kCount>(job, row, column, [&](int c) { return y[c - column] * weight_of(c); });
   if (row > 0) return;
-  const int more = job.n_row + (norm.moments.sums != nullptr ? 1 : 0);
-  if (norm.moments.sums != nullptr) store_begun<kCount>(job, job.n_row, column, weight_of);
-  if (norm.bias != nullptr) store_begun<kCount>(job, more, column, [&](int c) { return norm.bias[c]; });
+  const int after = job.n_row + (norm.moments.sums != nullptr ? 2 : 0);
+  if (norm.moments.sums != nullptr) store_twice<kCount>(job, job.n_row, column, weight_of);
+  if (norm.bias != nullptr) store_twice<kCount>(job, after, column, [&](int c) { return norm.bias[c]; });
 }
 
 }  // namespace vla::cuda

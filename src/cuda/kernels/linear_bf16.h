@@ -30,8 +30,8 @@ struct RowMoments {
 };
 /// The first half of a norm of y; products of the norm do the other half (NormEnd).
 struct NormBegin {
-  /// y * weight in bf16, with a stride that is even. The rows that NormEnd::n_more() counts follow: the weight, for a
-  /// layer norm, and the bias, if there is one. Null: no norm begins.
+  /// y * weight in bf16, with a stride that is even. The rows that NormEnd::n_more() counts follow: for a layer norm
+  /// the weight, and if there is one the bias, each as two rows, rounded and what that lacks. Null: no norm begins.
   std::uint16_t* rows = nullptr;
   std::int64_t stride = 0;
   const float *weight = nullptr, *bias = nullptr;  // [n_column], or null
@@ -45,7 +45,7 @@ struct NormEnd {
   bool has_bias = false;
 
   /// Rows of x after the last of y. With such rows, a block must have all rows.
-  VLA_HOST_DEVICE int n_more() const { return (moments.sums != nullptr ? 1 : 0) + (has_bias ? 1 : 0); }
+  VLA_HOST_DEVICE int n_more() const { return (moments.sums != nullptr ? 2 : 0) + (has_bias ? 2 : 0); }
 };
 
 struct LinearBf16Job {

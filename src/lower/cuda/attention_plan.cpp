@@ -49,14 +49,14 @@ double microseconds(const AttentionPlan& plan, const AttentionSize& size, int n_
 }  // namespace
 
 AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm,
-                             bool is_hopper) {
+                             bool has_clusters) {
   AttentionPlan best;
   for (const cuda::AttentionShape& shape : cuda::kAttentionShapes) {
     if (shape.depth < d_head || (best.shape != nullptr && shape.depth > best.shape->depth)) continue;
     const std::int64_t most = std::min<std::int64_t>(ceil_div(n_key, 64), cuda::kMaxAttentionSplit);
     for (std::int64_t n_split = 1; n_split <= std::max<std::int64_t>(most, 1); ++n_split)
       for (const bool in_cluster : {false, true}) {
-        if (in_cluster && !(is_hopper && shape.fits_cluster(n_split))) continue;
+        if (in_cluster && !(has_clusters && shape.fits_cluster(n_split))) continue;
         AttentionPlan plan = {&shape, static_cast<int>(n_split), in_cluster};
         plan.us = microseconds(plan, {d_head, n_row, n_unit, n_key}, n_sm);
         if (best.shape == nullptr || plan.us < best.us) best = plan;
@@ -69,7 +69,8 @@ AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op) {
   const std::int64_t n_key = std::accumulate(op.n_key.begin(), op.n_key.end(), std::int64_t{0});
   if (op.rounds) {
     const std::int64_t n_head_kv = l.value(op.packed[0]).shape[1];
-    return plan_attention(q[0], q[1] / n_head_kv * q[2], n_head_kv * q[3], n_key, l.n_sm, l.is_hopper);
+    return plan_attention(q[0], q[1] / n_head_kv * q[2], n_head_kv * q[3], n_key, l.n_sm,
+                          l.is_hopper && l.ways.clusters);
   }
   const std::int64_t n_block = q[1] * q[3] * ceil_div(q[2], 8);  // a lower bound
   const std::int64_t most = std::min<std::int64_t>(ceil_div(n_key, 128), cuda::kMaxAttentionSplit);

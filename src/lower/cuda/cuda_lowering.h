@@ -58,7 +58,7 @@ struct HalvedNorm {
 
   /// The values that the norm's products read beside `rows`.
   std::vector<ValueId> moments() const { return sums == kNone ? std::vector{squares} : std::vector{squares, sums}; }
-  int n_more() const { return (sums != kNone ? 1 : 0) + (bias != kNone ? 1 : 0); }  // cuda::NormEnd::n_more()
+  int n_more() const { return (sums != kNone ? 2 : 0) + (bias != kNone ? 2 : 0); }  // cuda::NormEnd::n_more()
 };
 
 struct CudaOp : Step {
@@ -107,8 +107,8 @@ struct CudaLowering : Lowering {
 /// value whose only reader is such a conversion is stored converted, and some products rotate the heads that they make.
 /// Also splits the depth of products, and lets norms add the shares.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
-/// Lets products begin and end norms where that is faster than an operation for the norm, and removes those
-/// operations. For a step of choose_layouts, before shares have values.
+/// Lets products of a solver step begin and end norms where that is faster than an operation for the norm, and removes
+/// those operations. Part of choose_layouts, before shares have values.
 void halve_norms(CudaLowering& l);
 /// The operation whose first result is this value, or null.
 CudaOp* maker_of(CudaLowering& l, ValueId id);
@@ -137,7 +137,7 @@ double us_with_norm(const ProductCut& cut);
 /// The tensor-core plan with the shortest estimated time. n_row: query rows per key head. n_unit: key heads of the
 /// whole batch.
 AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm,
-                             bool is_hopper);
+                             bool has_clusters);
 AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op);
 
 /// FLOP and bytes, see Program::work.

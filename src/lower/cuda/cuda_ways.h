@@ -11,7 +11,7 @@ namespace vla::lower {
 /// Ways to lower a graph that can be left out, because no GPU has shown yet that they are faster. The GPU kit measures
 /// acts without each.
 struct CudaWays {
-  bool clusters = true;      // blocks of a cluster add shares
+  bool clusters = true;      // blocks of a cluster add the shares of a product, or combine those of attention
   bool adders = true;        // kernels of their own add the shares of products of up to 64 rows
   bool halved_norms = true;  // products begin and end RMS norms
   bool rotations = true;     // products rotate heads

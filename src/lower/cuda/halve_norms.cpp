@@ -49,7 +49,7 @@ CudaOp* beginner_of(CudaLowering& l, const CudaOp& norm, const RoundOp& what) {
   if (maker == nullptr || !can_begin(l, *maker) || !is_before(l, what.weight, *maker) ||
       !is_before(l, what.bias, *maker))
     return nullptr;
-  const int n_more = (is_layer(what) ? 1 : 0) + (what.bias != kNone ? 1 : 0);
+  const int n_more = (is_layer(what) ? 2 : 0) + (what.bias != kNone ? 2 : 0);
   const auto needs_norm = [&](const CudaOp& op) { return reads(l, op, rows) && !can_end(l, op, rows, n_more); };
   return std::ranges::any_of(l.ops, needs_norm) ? nullptr : maker;
 }
@@ -102,6 +102,7 @@ CudaOp* maker_of(CudaLowering& l, ValueId id) {
 }
 
 void halve_norms(CudaLowering& l) {
+  if (!l.graph.stages().empty()) return;  // a prefix: computed once, mostly of more rows than fit
   for (CudaOp& op : l.ops)
     if (const auto* round = std::get_if<RoundOp>(&op.op)) halve_norm(l, op, *round);
   std::erase_if(l.ops, [](const CudaOp& op) { return op.writes.empty(); });
