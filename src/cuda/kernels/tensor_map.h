@@ -1,0 +1,15 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+
+namespace vla::cuda {
+
+/// CUtensorMap: rows in global memory of which Hopper copies boxes to shared memory. Only the driver knows what is in
+/// it (Gpu::map_rows). A kernel's job holds it, so that it lies in the kernel's parameters.
+struct alignas(64) TensorMap {
+  std::uint64_t opaque[16];
+};
+
+}  // namespace vla::cuda
