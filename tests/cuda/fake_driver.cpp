@@ -364,10 +364,12 @@ struct Calls {
     if (!state.driver.computes) return enqueue(stream, [] {});
     const auto* from = static_cast<const std::byte*>(parameters[0]);
     const std::vector<std::byte> bytes(from, from + size);
-    // A job is aligned as its type is, at most as memory is.
+    // A job is aligned as its type is, at most as a tensor map.
     return enqueue(stream, [=] {
-      const std::unique_ptr<std::byte[]> job(new std::byte[size]);
-      std::copy(bytes.begin(), bytes.end(), job.get());
+      constexpr std::size_t kAlign = alignof(vla::cuda::TensorMap);
+      const std::unique_ptr<void, decltype(&std::free)> job(
+          std::aligned_alloc(kAlign, (size + kAlign - 1) / kAlign * kAlign), std::free);
+      std::copy(bytes.begin(), bytes.end(), static_cast<std::byte*>(job.get()));
       device_memory().begin_launch();
       const Extent grid = {x, y, z, cluster};
       function->ptx ? run_ptx(*function->ptx, grid, n_thread, shared, job.get())

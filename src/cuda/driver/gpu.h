@@ -106,13 +106,6 @@ struct GpuInfo {
 /// `found`.
 Result<std::vector<GpuInfo>> list_gpus(const Driver& driver);
 
-/// Rows of bf16 in device memory, `stride` elements apart: a multiple of 8, as the address is of 16 bytes.
-struct MappedRows {
-  const std::uint16_t* rows;
-  int n_row, depth;
-  std::int64_t stride;
-  int box_rows;  // at most 256
-};
 /// A map for copies of boxes of box_rows rows and 128 bytes of the depth, swizzled as wgmma takes them (hopper.h). What
 /// is outside of the rows and the depth is zeros. Nothing is read; the rows need not be there yet.
 Result<TensorMap> map_rows(const Driver& driver, const MappedRows& of);

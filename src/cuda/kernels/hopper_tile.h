@@ -93,6 +93,8 @@ class TileEnd {
     else
       leave_rows<1, false>(sums, partial, of_row, word);
   }
+  /// What a warp of the block that has no sums calls in the place of `leave` or of `finish` of an undivided depth.
+  static VLA_DEVICE void attend() { __syncthreads(); }
   /// Computes y from value(of_row(row), a sum, index of the column among the thread's four), once all threads of the
   /// block, or of the cluster, have called it. `then` also gets y, see LeavesY.
   template <class OfRow, class Value, class Then = LeavesY>

@@ -12,4 +12,12 @@ struct alignas(64) TensorMap {
   std::uint64_t opaque[16];
 };
 
+/// Rows of bf16 in device memory, `stride` elements apart: a multiple of 8, as the address is of 16 bytes.
+struct MappedRows {
+  const std::uint16_t* rows;
+  int n_row, depth;
+  std::int64_t stride;
+  int box_rows;  // at most 256
+};
+
 }  // namespace vla::cuda
