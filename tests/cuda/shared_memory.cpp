@@ -26,7 +26,7 @@ void SharedMemory::begin(std::size_t size, int n_thread, std::size_t rank) {
   open_.assign(n, {}), committed_.assign(n, {});
   fences_.assign(n, {}), async_done_.assign(n / kWarp, {}), async_readers_.clear();
   cluster_time_ = begin_time_ = barrier_time_ = ++time_;  // whatever the block before did is over
-  others_read_.clear(), is_touched_ = has_ended_ = false;
+  others_read_.clear(), is_read_ = has_ended_ = false;
   rank_ = rank, n_change_ = 0, of_cluster_ = {};
   mbarriers_.clear(), bulk_copies_.clear(), on_their_way_.clear(), knowledge_.clear();
 }
@@ -113,7 +113,7 @@ void SharedMemory::read_by_other(std::size_t offset, std::size_t size) {
   if (has_ended_) throw Fault("reads shared memory of a block that has ended");
   if (cluster_time_ == begin_time_) throw Fault("reads shared memory of another block before a barrier of the cluster");
   others_read_.resize((size_ + 3) / 4);
-  is_touched_ = true;
+  is_read_ = true;
   for (std::size_t i = offset / 4; i < (offset + size + 3) / 4; ++i) {
     const Event& write = words_[i].write;  // perhaps of a copy that has not arrived
     if (write.thread == kBulk ? !is_over(write, of_cluster_) : write.time >= cluster_time_)
@@ -123,7 +123,8 @@ void SharedMemory::read_by_other(std::size_t offset, std::size_t size) {
 }
 
 void SharedMemory::cluster_barrier(bool releases) {
-  is_touched_ = false;
+  is_read_ = false;
+  for (auto& [offset, begun] : mbarriers_) begun.n_awaited = 0;
   if (!releases) return;
   barrier();
   cluster_time_ = barrier_time_;
@@ -132,7 +133,9 @@ void SharedMemory::cluster_barrier(bool releases) {
 
 void SharedMemory::end() {
   has_ended_ = true;
-  if (is_touched_) throw Fault("ends while another block of its cluster may read its shared memory or arrive there");
+  if (is_read_) throw Fault("ends while another block of its cluster may read its shared memory");
+  for (const auto& [offset, begun] : mbarriers_)
+    if (begun.n_awaited > begun.mbarrier.n_waited()) throw Fault("ends while another block may arrive at its mbarrier");
   for (const BulkCopy& copy : bulk_copies_)
     for (const auto& [offset, begun] : mbarriers_)
       if (begun.mbarrier.number() == copy.mbarrier && begun.mbarrier.n_waited() <= copy.phase)
@@ -234,7 +237,7 @@ void SharedMemory::begin_mbarrier(std::size_t offset, int n_arrival, int thread)
   knowledge_of(thread);
   const std::size_t number = rank_ * kMostMbarriers + mbarriers_.size();
   if (mbarriers_.size() == kMostMbarriers) throw Fault("more mbarriers than are known");
-  mbarriers_.emplace(offset, Begun{Mbarrier(number, n_arrival), now(thread), false});
+  mbarriers_.emplace(offset, Begun{Mbarrier(number, n_arrival), now(thread), false, 0});
 }
 
 void SharedMemory::fence_mbarriers(int thread) {
@@ -263,13 +266,13 @@ void SharedMemory::check_no_mbarrier(std::size_t offset, std::size_t size) const
 }
 
 void SharedMemory::arrive(std::size_t offset, std::int64_t n_byte, SharedMemory& block, int thread) {
-  Mbarrier& mbarrier = find_mbarrier(offset, block, thread).mbarrier;
-  if (&block != this) is_touched_ = true;
+  Begun& begun = find_mbarrier(offset, block, thread);
+  if (&block != this) begun.n_awaited = begun.mbarrier.n_phase() + 1;
   Knowledge& knows = block.knowledge_of(thread);
   const auto warp = static_cast<std::size_t>(thread / kWarp);
   knows.learn(block.rank_ * kMostWarps + warp, {block.time_, block.warp_time_[warp], thread});
   ++block.time_, ++n_change_;
-  mbarrier.arrive(knows, n_byte);
+  begun.mbarrier.arrive(knows, n_byte);
 }
 
 bool SharedMemory::try_wait(std::size_t offset, unsigned parity, int thread) {

@@ -117,6 +117,7 @@ class SharedMemory {
     Mbarrier mbarrier;
     Event begin;
     bool is_fenced;
+    std::uint64_t n_awaited = 0;  // phases that other blocks have arrived in since the cluster's last barrier
   };
   static constexpr int kNobody = -1, kManyOfWarp = 1 << 20, kMany = 1 << 21;
   static constexpr int kBulk = 1 << 22;  // a writer: the bulk copy whose number its time is
@@ -162,7 +163,7 @@ class SharedMemory {
   std::vector<std::array<std::uint32_t, kMostWarps>> async_readers_;  // of 16 bytes and a warp: the last group, from 1
   std::vector<std::uint64_t> others_read_;       // of each word, when another block read it; empty until one has
   std::uint64_t cluster_time_ = 1;               // after the cluster's last barrier that released
-  bool is_touched_ = false, has_ended_ = false;  // is_touched_: by another block since the cluster's last barrier
+  bool is_read_ = false, has_ended_ = false;  // is_read_: by another block since the cluster's last barrier
   std::map<std::size_t, Begun> mbarriers_;       // by their offsets
   std::vector<BulkCopy> bulk_copies_;
   std::vector<std::size_t> on_their_way_;  // of these

@@ -77,9 +77,10 @@ struct Fetch {
 };
 
 /// What the last warp does: its first lane fetches all steps, the first weights before earlier kernels have ended.
+/// Returns the stages in that lane's turn.
 template <class T>
-VLA_DEVICE void fetch_all(const Fetch<T>& fetch, std::byte* shared, int n_step) {
-  const bool is_first = thread_index() % kLanes == 0;
+VLA_DEVICE Stages<T> fetch_all(const Fetch<T>& fetch, std::byte* shared, int n_step) {
+  const bool is_first = thread_index() == T::kMultipliers;
   const int n_ahead = n_step < T::kStages ? n_step : T::kStages;
   Stages<T> stages = {shared};
   for (int i = 0; is_first && i < n_ahead; ++i, stages.go_on()) fetch.weights(stages, i);
@@ -93,12 +94,23 @@ VLA_DEVICE void fetch_all(const Fetch<T>& fetch, std::byte* shared, int n_step) 
     fetch.rows(stages, i);
   }
   __syncwarp();
+  return stages;
+}
+
+/// Waits until all warps of the cluster have read what was fetched last: then none arrives here any more, and the block
+/// may end.
+template <class T>
+VLA_DEVICE void wait_for_readers(Stages<T> stages, int n_step) {
+  for (int i = 0; i < n_step && i < T::kStages; ++i, stages.go_on()) dev::wait_mbarrier(stages.empty(), stages.parity);
 }
 
 /// What the other warps do. A stage is free once the products after those that read it have been issued.
 template <class T>
 VLA_DEVICE void multiply_all(float (&sum)[T::kRows / 2], std::byte* shared, int n_step) {
-  const int lane = thread_index() % kLanes;
+  const auto leave = [](const Stages<T>& stages) {  // in all blocks, an arrival of a lane each
+    const int lane = thread_index() % kLanes;
+    if (lane < kTmaCluster) dev::arrive_at_block(stages.empty(), lane);
+  };
   const std::uint64_t of_stage = T::kStage / 16;
   const std::uint64_t w0 = swizzled_descriptor(shared + thread_index() / 128 * 64 * kSwizzledRow);
   const std::uint64_t x0 = swizzled_descriptor(shared + T::kBytesW);
@@ -112,10 +124,13 @@ VLA_DEVICE void multiply_all(float (&sum)[T::kRows / 2], std::byte* shared, int 
     for (int k = 0; k < 4; ++k) dev::wgmma_bf16<T::kRows>(sum, w + 2 * k, x + 2 * k, i + k > 0);
     dev::wgmma_commit();
     dev::wgmma_wait<1>();
-    if (i > 0 && lane < kTmaCluster) dev::arrive_at_block(before.empty(), lane);
+    if (i > 0) leave(before);
     before = stages;
     stages.go_on();
   } while (++i < n_step);
+  dev::let_next_begin();
+  dev::wgmma_wait_all(sum);
+  leave(before);
 }
 
 template <class T>
@@ -127,18 +142,18 @@ VLA_DEVICE void multiply(const HopperTmaJob& job) {
   dev::meet_cluster();  // mbarriers of all blocks have begun
   using End = TileEnd<float, T::kColumns, T::kRows, T::kGated>;
   if (thread_index() >= T::kMultipliers) {
-    fetch_all<T>({job, place}, shared, n_step);
+    const Stages<T> stages = fetch_all<T>({job, place}, shared, n_step);
     dev::let_next_begin();
-    dev::meet_cluster();
-    return End::attend();
+    __syncthreads();
+    End::attend();
+    if (thread_index() == T::kMultipliers) wait_for_readers(stages, n_step);
+    return;
   }
   float sum[T::kRows / 2] = {};
   dev::wait_for_earlier();
   const float factor = thread_index() < T::kRows ? factor_of_row(job.product, place.row0 + thread_index()) : 1;
   multiply_all<T>(sum, shared, n_step);
-  dev::let_next_begin();
-  dev::wgmma_wait_all(sum);
-  dev::meet_cluster();  // all have read their stages, whose memory is reused for sums, and none arrives any more
+  __syncthreads();  // the stages' memory is reused for sums
   End::place(sum, shared);
   std::byte* const factors = shared + T::kRows * (T::kColumns + 4) * 4;
   static_assert(T::kRows * (T::kColumns + 5) * 4 <= T::kStages * T::kStage);
