@@ -400,5 +400,5 @@ MISTAKES |= {
     "NaN keeps the device's bits": ("rows.cu", "rows", "rounded == rounded ?", "true ?"),
     "a long row is looked up from its beginning only": ("rows.cu", "rows", "static_cast<int>(blockIdx.y) * kLookupBlock", "0"),
 }
-TESTS = {"linear_strip": "*linear_float_test*,*halved_norm_test*", "linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*,*halved_norm_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*,*halved_norm_test*", "hopper_linear_int8": "*linear_int8_test*",
+TESTS = {"linear_strip": "*linear_float_test*,*halved_norm_test*", "linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*,*halved_norm_test*", "linear_f32": "*linear_float_test*", "hopper_linear_bf16": "*hopper_linear_test*,*halved_norm_test*", "hopper_linear_int8": "*linear_int8_test*", "hopper_tma_bf16": "*hopper_tma_test*",
          "attention": "*attention_test*", "attention_f32": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*", "channel_attention": "*channel_attention_test*"}  # fmt: skip
