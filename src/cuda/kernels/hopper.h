@@ -51,7 +51,8 @@ VLA_DEVICE void arrive_expecting(std::byte* mbarrier, int n_byte) {
   asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(shared_address(mbarrier)), "r"(n_byte)
                : "memory");
 }
-/// Arrives at the mbarrier that block `rank` of the cluster has where this block has one.
+/// Arrives at the mbarrier that block `rank` of the cluster has where this block has one: to say that wgmma has read a
+/// stage. What threads wrote it makes visible to the own block alone, as more would cost a MEMBAR.GPU.
 VLA_DEVICE void arrive_at_block(std::byte* mbarrier, int rank) {
   unsigned of_block;
   asm("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(of_block) : "r"(shared_address(mbarrier)), "r"(rank));

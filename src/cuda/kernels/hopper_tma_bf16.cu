@@ -143,7 +143,6 @@ VLA_DEVICE void multiply(const HopperTmaJob& job) {
   using End = TileEnd<float, T::kColumns, T::kRows, T::kGated>;
   if (thread_index() >= T::kMultipliers) {
     const Stages<T> stages = fetch_all<T>({job, place}, shared, n_step);
-    dev::let_next_begin();
     __syncthreads();
     End::attend();
     if (thread_index() == T::kMultipliers) wait_for_readers(stages, n_step);
