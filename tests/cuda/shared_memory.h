@@ -161,10 +161,10 @@ class SharedMemory {
   std::vector<std::vector<std::uint64_t>> fences_;                    // of each thread: their times
   std::vector<std::vector<std::uint64_t>> async_done_;                // of each warp and group: its time
   std::vector<std::array<std::uint32_t, kMostWarps>> async_readers_;  // of 16 bytes and a warp: the last group, from 1
-  std::vector<std::uint64_t> others_read_;       // of each word, when another block read it; empty until one has
-  std::uint64_t cluster_time_ = 1;               // after the cluster's last barrier that released
+  std::vector<std::uint64_t> others_read_;    // of each word, when another block read it; empty until one has
+  std::uint64_t cluster_time_ = 1;            // after the cluster's last barrier that released
   bool is_read_ = false, has_ended_ = false;  // is_read_: by another block since the cluster's last barrier
-  std::map<std::size_t, Begun> mbarriers_;       // by their offsets
+  std::map<std::size_t, Begun> mbarriers_;    // by their offsets
   std::vector<BulkCopy> bulk_copies_;
   std::vector<std::size_t> on_their_way_;  // of these
   std::vector<Knowledge> knowledge_;       // of each thread; empty until an mbarrier has begun

@@ -24,13 +24,11 @@ struct HopperTmaTile {
   int columns_y() const { return is_gated ? columns / 2 : columns; }
 };
 constexpr HopperTmaTile kHopperTmaTiles[] = {
-#define VLA_HOPPER_TMA_TILE(columns, rows)                              \
-  {"hopper_tma_bf16_" #columns "x" #rows, columns, rows, false}, {      \
-    "hopper_tma_bf16_" #columns "x" #rows "_gated", columns, rows, true \
-  }
-#define VLA_HOPPER_TMA_TILE_AND(columns, rows) VLA_HOPPER_TMA_TILE(columns, rows),
-    VLA_HOPPER_TMA_TILES(VLA_HOPPER_TMA_TILE_AND)
-#undef VLA_HOPPER_TMA_TILE_AND
+#define VLA_HOPPER_TMA_TILE(columns, rows) {"hopper_tma_bf16_" #columns "x" #rows, columns, rows, false},
+    VLA_HOPPER_TMA_TILES(VLA_HOPPER_TMA_TILE)
+#undef VLA_HOPPER_TMA_TILE
+#define VLA_HOPPER_TMA_TILE(columns, rows) {"hopper_tma_bf16_" #columns "x" #rows "_gated", columns, rows, true},
+        VLA_HOPPER_TMA_TILES(VLA_HOPPER_TMA_TILE)
 #undef VLA_HOPPER_TMA_TILE
 };
 
