@@ -15,6 +15,7 @@
 #include "cuda/fault.h"
 #include "cuda/fiber.h"
 #include "cuda/fragments.h"
+#include "cuda/tensor_map.h"
 #include "cuda/wgmma.h"
 
 namespace vla::test::cuda {
@@ -56,8 +57,9 @@ struct Cluster {
   std::vector<std::unique_ptr<Block>> blocks;  // the first n_block of them run
   std::size_t n_block = 0, n_thread = 0, n_done = 0;
   std::vector<Thread*> ready;  // the last one goes on first, so that a warp runs until it waits for another
-  std::vector<Thread*> at_barrier;
-  bool releases = true;  // that barrier
+  std::vector<Thread*> at_barrier, at_mbarrier;
+  std::uint64_t n_change = 0;  // of its mbarriers, when threads that wait for one last went on
+  bool releases = true;        // that barrier
   Fiber main;
   Thread* self = nullptr;
   std::minstd_rand random;
@@ -70,8 +72,37 @@ Cluster cluster;
 Block& own_block() { return *cluster.self->block; }
 Warp& own_warp() { return own_block().warps[static_cast<std::size_t>(cluster.self->number / kWarp)]; }
 
+void release(std::vector<Thread*> threads) {
+  if (schedule.seed) std::shuffle(threads.begin(), threads.end(), cluster.random);
+  cluster.ready.insert(cluster.ready.end(), threads.rbegin(), threads.rend());
+}
+
+/// Where all wait, those that wait for mbarriers look again, once something has changed. If nothing has, a copy
+/// arrives.
+void look_again() {
+  if (!cluster.ready.empty() || cluster.at_mbarrier.empty() || !cluster.fault.empty()) return;
+  std::vector<SharedMemory*> blocks;
+  const auto n_change = [&] {
+    std::uint64_t n = 0;
+    for (const SharedMemory* block : blocks) n += block->n_change();
+    return n;
+  };
+  for (std::size_t i = 0; i < cluster.n_block; ++i) blocks.push_back(&cluster.blocks[i]->shared);
+  if (n_change() == cluster.n_change && !SharedMemory::bring_one(blocks, cluster.random)) {
+    cluster.fault = "waits for a phase of an mbarrier that never comes";
+    return;
+  }
+  cluster.n_change = n_change();
+  release(std::exchange(cluster.at_mbarrier, {}));
+}
+
 /// Another thread goes on, or the launch where none can.
 void go_on(Fiber& from) {
+  try {
+    look_again();
+  } catch (const Fault& problem) {
+    cluster.fault = problem.what();
+  }
   if (cluster.ready.empty() && cluster.fault.empty() && cluster.n_done < cluster.n_thread)
     cluster.fault = cluster.at_barrier.empty()
                         ? "every thread waits: some came to another barrier or instruction of a warp, or ended"
@@ -85,11 +116,6 @@ void go_on(Fiber& from) {
   cluster.self = next;
   threadIdx.x = static_cast<unsigned>(next->number), blockIdx.z = next->block->z;
   if (&next->fiber != &from) from.switch_to(next->fiber);
-}
-
-void release(std::vector<Thread*> threads) {
-  if (schedule.seed) std::shuffle(threads.begin(), threads.end(), cluster.random);
-  cluster.ready.insert(cluster.ready.end(), threads.rbegin(), threads.rend());
 }
 
 void thread_main() {
@@ -116,7 +142,7 @@ void begin_block(Block& block, unsigned z, int n_thread, std::size_t shared, std
   block.warps.resize(n / kWarp);
   block.at_barrier.clear();
   block.z = z, block.n_done = 0;
-  block.shared.begin(shared, n_thread);
+  block.shared.begin(shared, n_thread, z % cluster.n_block);
   for (std::size_t i = 0; i < block.warps.size(); ++i) block.warps[i].wgmma.begin(block.shared, static_cast<int>(i));
   for (std::size_t i = 0; i < n; ++i) {
     block.threads[i]->number = static_cast<int>(i), block.threads[i]->block = &block;
@@ -128,11 +154,12 @@ void begin_block(Block& block, unsigned z, int n_thread, std::size_t shared, std
 /// Runs the blocks from z on that are a cluster.
 void run_cluster(unsigned z, std::size_t n_block, int n_thread, std::size_t shared) {
   while (cluster.blocks.size() < n_block) cluster.blocks.push_back(std::make_unique<Block>());
-  cluster.ready.clear(), cluster.at_barrier.clear(), cluster.fault.clear();
+  cluster.ready.clear(), cluster.at_barrier.clear(), cluster.at_mbarrier.clear(), cluster.fault.clear();
+  cluster.n_block = n_block, cluster.n_change = 0;
   std::vector<Thread*> all;
   for (std::size_t i = 0; i < n_block; ++i)
     begin_block(*cluster.blocks[i], z + static_cast<unsigned>(i), n_thread, shared, all);
-  cluster.n_block = n_block, cluster.n_thread = all.size(), cluster.n_done = 0;
+  cluster.n_thread = all.size(), cluster.n_done = 0;
   release(all);
   go_on(cluster.main);
   if (!cluster.fault.empty())
@@ -207,9 +234,14 @@ void check_shared(const std::byte* p, std::size_t size, bool writes) {
   const std::size_t at = shared.offset(p);
   writes ? shared.write(at, size, cluster.self->number) : shared.read(at, size, cluster.self->number);
 }
-const std::byte* of_block(const std::byte* p, std::size_t size, int rank) {
+namespace {
+Block& block_of_rank(int rank) {
   if (rank < 0 || static_cast<std::size_t>(rank) >= cluster.n_block) fault("the cluster has no such block");
-  Block &own = own_block(), &other = *cluster.blocks[static_cast<std::size_t>(rank)];
+  return *cluster.blocks[static_cast<std::size_t>(rank)];
+}
+}  // namespace
+const std::byte* of_block(const std::byte* p, std::size_t size, int rank) {
+  Block &own = own_block(), &other = block_of_rank(rank);
   const std::size_t at = own.shared.offset(p);
   &own == &other ? own.shared.read(at, size, cluster.self->number) : other.shared.read_by_other(at, size);
   return other.shared.data() + at;
@@ -224,6 +256,39 @@ void wait_copies(std::size_t n_left) { own_block().shared.wait(n_left, cluster.s
 
 unsigned shared_address(const std::byte* p) { return static_cast<unsigned>(own_block().shared.offset(p)); }
 void fence_async_proxy() { own_block().shared.fence_async(cluster.self->number); }
+
+void begin_mbarrier(std::byte* mbarrier, int n_arrival) {
+  SharedMemory& shared = own_block().shared;
+  shared.begin_mbarrier(shared.offset(mbarrier), n_arrival, cluster.self->number);
+}
+void fence_mbarriers() { own_block().shared.fence_mbarriers(cluster.self->number); }
+void arrive(std::byte* mbarrier, int n_byte) {
+  SharedMemory& shared = own_block().shared;
+  shared.arrive(shared.offset(mbarrier), n_byte, shared, cluster.self->number);
+}
+void arrive_at_block(std::byte* mbarrier, int rank) {
+  SharedMemory& shared = own_block().shared;
+  block_of_rank(rank).shared.arrive(shared.offset(mbarrier), 0, shared, cluster.self->number);
+}
+void wait_mbarrier(std::byte* mbarrier, unsigned parity) {
+  SharedMemory& shared = own_block().shared;
+  while (!shared.try_wait(shared.offset(mbarrier), parity, cluster.self->number)) {
+    cluster.at_mbarrier.push_back(cluster.self);
+    go_on(cluster.self->fiber);
+  }
+}
+void copy_box(std::byte* to, const void* map, int column, int row, std::byte* mbarrier, unsigned blocks) {
+  SharedMemory& shared = own_block().shared;
+  const std::size_t at = shared.offset(to);
+  const std::vector<std::byte> box = copy_box(
+      map, column, row, at, [](std::uintptr_t from, std::size_t) { return reinterpret_cast<const std::byte*>(from); });
+  const auto copy = [&](SharedMemory& block) {
+    block.bulk_copy(at, box, shared.offset(mbarrier), shared, cluster.self->number);
+  };
+  if (blocks == 0) copy(shared);
+  for (int rank = 0; blocks >> rank != 0; ++rank)
+    if (blocks >> rank & 1) copy(block_of_rank(rank).shared);
+}
 
 namespace {
 

@@ -80,6 +80,13 @@ void commit_copies();
 void wait_copies(std::size_t n_left);
 unsigned shared_address(const std::byte* p);
 void fence_async_proxy();
+void begin_mbarrier(std::byte* mbarrier, int n_arrival);
+void fence_mbarriers();
+void arrive(std::byte* mbarrier, int n_byte);
+void arrive_at_block(std::byte* mbarrier, int rank);
+void wait_mbarrier(std::byte* mbarrier, unsigned parity);
+/// Copies a box of a tensor map to those blocks of the cluster whose bits are set; 0: this one.
+void copy_box(std::byte* to, const void* map, int column, int row, std::byte* mbarrier, unsigned blocks);
 
 /// A product of a warpgroup: sums[64][n] (+)= a[64][depth] * b[n][depth].
 struct WgmmaProduct {
@@ -136,6 +143,17 @@ inline void copy_async(std::byte* to, const void* from, int size) {
 template <int kLeft>
 void wait_copies() {
   test::cuda::wait_copies(kLeft);
+}
+using test::cuda::arrive_at_block, test::cuda::begin_mbarrier, test::cuda::fence_mbarriers, test::cuda::wait_mbarrier;
+inline void arrive(std::byte* mbarrier) { test::cuda::arrive(mbarrier, 0); }
+inline void arrive_expecting(std::byte* mbarrier, int n_byte) { test::cuda::arrive(mbarrier, n_byte); }
+template <class Map>
+void copy_box(std::byte* to, const Map& map, int column, int row, std::byte* mbarrier) {
+  test::cuda::copy_box(to, &map, column, row, mbarrier, 0);
+}
+template <class Map>
+void copy_box_to_blocks(std::byte* to, const Map& map, int column, int row, std::byte* mbarrier, unsigned blocks) {
+  test::cuda::copy_box(to, &map, column, row, mbarrier, blocks);
 }
 inline void meet_cluster() { test::cuda::cluster_barrier(true); }
 inline void leave_cluster() { test::cuda::cluster_barrier(false); }

@@ -17,6 +17,7 @@
 #include "cuda/fault.h"
 #include "cuda/machine.h"
 #include "cuda/ptx.h"
+#include "cuda/tensor_map.h"
 
 namespace vla::test::cuda {
 namespace {
@@ -184,6 +185,7 @@ struct Calls {
     *name = error == kOutOfMemory      ? "CUDA_ERROR_OUT_OF_MEMORY"
             : error == kLaunchFailed   ? "CUDA_ERROR_LAUNCH_FAILED"
             : error == kInvalidCluster ? "CUDA_ERROR_INVALID_CLUSTER_SIZE"
+            : error == kInvalidValue   ? "CUDA_ERROR_INVALID_VALUE"
                                        : nullptr;
     return *name ? 0 : kInvalidValue;
   }
@@ -363,10 +365,12 @@ struct Calls {
     if (!state.driver.computes) return enqueue(stream, [] {});
     const auto* from = static_cast<const std::byte*>(parameters[0]);
     const std::vector<std::byte> bytes(from, from + size);
-    // A job is aligned as its type is, at most as memory is.
+    // A job is aligned as its type is, at most as a tensor map.
     return enqueue(stream, [=] {
-      const std::unique_ptr<std::byte[]> job(new std::byte[size]);
-      std::copy(bytes.begin(), bytes.end(), job.get());
+      constexpr std::size_t kAlign = alignof(vla::cuda::TensorMap);
+      const std::unique_ptr<void, decltype(&std::free)> job(
+          std::aligned_alloc(kAlign, (size + kAlign - 1) / kAlign * kAlign), std::free);
+      std::copy(bytes.begin(), bytes.end(), static_cast<std::byte*>(job.get()));
       device_memory().begin_launch();
       const Extent grid = {x, y, z, cluster};
       function->ptx ? run_ptx(*function->ptx, grid, n_thread, shared, job.get())
@@ -412,6 +416,29 @@ struct Calls {
   }
   static int graph_destroy(Handle graph) { return take_back(state.graphs, graph); }
   static int executable_destroy(Handle executable) { return take_back(state.graphs, executable); }
+  /// Refuses what the driver refuses, and what a machine of tests does not know.
+  static int tensor_map(void* map, int type, unsigned n_dimension, void* address, const std::uint64_t* sizes,
+                        const std::uint64_t* strides, const unsigned* box, const unsigned* steps, int interleave,
+                        int swizzle, int promotion, int fill) {
+    constexpr int kBf16 = 9, kSwizzle128 = 3;
+    constexpr std::uint64_t kMostSize = std::uint64_t{1} << 32, kMostStride = std::uint64_t{1} << 40, kElement = 2;
+    const auto is_aligned = [](const void* p, std::uintptr_t to) {
+      return p != nullptr && reinterpret_cast<std::uintptr_t>(p) % to == 0;
+    };
+    if (!is_aligned(map, 64) || !is_aligned(address, 16)) return kInvalidValue;
+    if (type != kBf16 || n_dimension != 2 || interleave != 0 || swizzle != kSwizzle128 || fill != 0)
+      return kInvalidValue;
+    if (promotion < 0 || promotion > 3) return kInvalidValue;
+    for (int i = 0; i < 2; ++i)
+      if (sizes[i] == 0 || sizes[i] > kMostSize || box[i] == 0 || box[i] > 256 || steps[i] != 1) return kInvalidValue;
+    if (strides[0] % 16 != 0 || strides[0] >= kMostStride || strides[0] < sizes[0] * kElement) return kInvalidValue;
+    if (box[0] * kElement % 16 != 0 || box[0] * kElement > 128) return kInvalidValue;
+    TensorMapFields of = {.address = reinterpret_cast<std::uint64_t>(address), .n_column = sizes[0], .n_row = sizes[1]};
+    of.stride = strides[0], of.box_columns = box[0], of.box_rows = box[1];
+    std::memset(map, 0, sizeof(vla::cuda::TensorMap));
+    std::memcpy(map, &of, sizeof(of));
+    return 0;
+  }
 
  private:
   /// Whether attributes of a launch are known: that it may begin while the kernel before it ends, and its blocks of a
@@ -482,6 +509,12 @@ void reset_fake_driver() {
   }
   for (void* memory : state.host) std::free(memory);
   state = {};
+}
+
+vla::cuda::Driver tensor_map_driver() {
+  vla::cuda::Driver table;
+  table.tensor_map = Calls::tensor_map, table.error_name = Calls::error_name, table.error_text = Calls::error_text;
+  return table;
 }
 
 vla::cuda::Driver fake_driver_table() {

@@ -54,5 +54,7 @@ FakeDriver& fake_driver();
 /// As it was at first, with nothing held.
 void reset_fake_driver();
 vla::cuda::Driver fake_driver_table();
+/// What makes tensor maps alone: it needs no device, and is not counted.
+vla::cuda::Driver tensor_map_driver();
 
 }  // namespace vla::test::cuda

@@ -211,6 +211,24 @@ TEST_CASE("machine code is loaded by a driver that takes it on the architecture 
   }
 }
 
+TEST_CASE("rows are mapped for a GPU as its driver takes them, or refused") {
+  reset_fake_driver();
+  auto gpu = Gpu::open(fake_driver_table(), 0, modules_of_tests());
+  REQUIRE(gpu);
+  auto memory = (*gpu)->allocate(4096, "rows");
+  REQUIRE(memory);
+  const auto* rows = memory->as<std::uint16_t>();
+  CHECK((*gpu)->map_rows({rows, 8, 61, 64, 256}));
+  CHECK(fake_driver().n_call["cuTensorMapEncodeTiled"] == 1);
+  for (const MappedRows& refused :
+       {MappedRows{rows + 4, 8, 64, 64, 8}, MappedRows{rows, 8, 60, 60, 8}, MappedRows{rows, 8, 72, 64, 8},
+        MappedRows{rows, 8, 64, 64, 257}, MappedRows{rows, 8, 64, 64, 0}, MappedRows{rows, 0, 64, 64, 8}}) {
+    const auto map = (*gpu)->map_rows(refused);
+    REQUIRE(!map);
+    CHECK(map.error().message().find("cuda tensor_map: CUDA_ERROR_INVALID_VALUE") != std::string::npos);
+  }
+}
+
 TEST_CASE("capturing refuses what no graph can hold, and a stream that is not waited for") {
   reset_fake_driver();
   auto gpu = Gpu::open(fake_driver_table(), 0, modules_of_tests());

@@ -48,6 +48,12 @@ bool is_hopper() { return true; }
 double bf16_sum_error(int) { return 0; }
 std::vector<std::string> modules_of_tests() { return runs_ptx() ? texts() : std::vector<std::string>{kHostModule}; }
 
+vla::cuda::TensorMap map_rows(const vla::cuda::MappedRows& of) {
+  const Result<vla::cuda::TensorMap> map = vla::cuda::map_rows(tensor_map_driver(), of);
+  if (!map) throw Fault(map.error().message());
+  return *map;
+}
+
 void launch(const vla::cuda::Launch& how, const void* job, std::size_t job_size) {
   const std::string name = how.kernel;
   const auto refuse = [&](const std::string& why) { throw Fault(name + ": " + why); };

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "cuda/device_memory.h"
+#include "cuda/driver/gpu.h"
 #include "cuda/kernels/launch.h"
 #include "cuda/shared_memory.h"
 
@@ -21,6 +22,9 @@ template <class Job>
 void launch(const vla::cuda::Launch& how, const Job& job) {
   launch(how, &job, sizeof(job));
 }
+
+/// As the device's driver maps rows. Throws Fault where it refuses to.
+vla::cuda::TensorMap map_rows(const vla::cuda::MappedRows& of);
 
 /// Whether kernels run as PTX: where VLA_CUDA_PTX names files, FILE:FILE.
 bool runs_ptx();

@@ -84,4 +84,51 @@ VLA_KERNEL(misbehave, 64, 1, MisbehaveJob) {
   job.y[static_cast<int>(blockIdx.x + blockIdx.z) * 64 + thread] = sum;
 }
 
+/// Reads the copies' first words of 32 half rows in each round, and adds them up.
+VLA_DEVICE unsigned read_rounds(const MisbehaveCopyJob& job, std::byte* full, std::byte* empty) {
+  using test::cuda::Mistake;
+  const int lane = thread_index() % kLanes;
+  unsigned sum = 0;
+  const auto arrive = [&] {
+    if (lane == 0 || (lane == 1 && job.mistake != Mistake::arrival_at_one_block)) dev::arrive_at_block(empty, lane);
+  };
+  for (int i = 0; i < job.kRounds; ++i) {
+    const unsigned parity = job.mistake == Mistake::wait_for_other_parity ? i % 2 == 0 : i % 2;
+    if (job.mistake != Mistake::no_wait_for_copies) dev::wait_mbarrier(full, parity);
+    if (job.mistake == Mistake::arrival_before_read) arrive();
+    sum += dev::read<unsigned>(dev::shared_memory() + lane * 64);
+    if (job.mistake != Mistake::arrival_without_warp_barrier) __syncwarp();
+    if (job.mistake != Mistake::arrival_before_read) arrive();
+    if (job.mistake == Mistake::arrival_too_often) arrive();
+  }
+  return sum;
+}
+
+VLA_KERNEL(misbehave_with_copies, 64, 1, MisbehaveCopyJob) {
+  using test::cuda::Mistake;
+  constexpr int kBox = 1024;
+  std::byte *shared = dev::shared_memory(), *full = shared + 2 * kBox, *empty = full + 8;
+  const int thread = thread_index(), rank = static_cast<int>(blockIdx.z);
+  if (thread == 0) {
+    dev::begin_mbarrier(full, 1), dev::begin_mbarrier(empty, 2);
+    if (job.mistake != Mistake::no_fence_of_mbarriers) dev::fence_mbarriers();
+  }
+  if (job.mistake != Mistake::no_barrier_after_begin) dev::meet_cluster();
+  if (thread < kLanes && job.mistake != Mistake::nobody_waits)
+    job.y[rank * kLanes + thread] = read_rounds(job, full, empty);
+  const int n_round = job.mistake == Mistake::nobody_waits ? 1 : job.kRounds;
+  for (int i = 0; thread == kLanes && i < n_round; ++i) {
+    if (job.mistake != Mistake::no_wait_for_readers) dev::wait_mbarrier(empty, i % 2 == 0);
+    if (job.mistake == Mistake::nothing_expected)
+      dev::arrive(full);
+    else
+      dev::arrive_expecting(full, 2 * kBox + (job.mistake == Mistake::too_few_bytes    ? -16
+                                              : job.mistake == Mistake::too_many_bytes ? 16
+                                                                                       : 0));
+    dev::copy_box_to_blocks(shared + rank * kBox, job.x, 0, (2 * i + rank) * job.kBoxRows, full,
+                            job.mistake == Mistake::copy_to_one_block ? 1U << rank : 3);
+  }
+  if (job.mistake != Mistake::end_without_others) dev::leave_cluster();
+}
+
 }  // namespace vla::cuda

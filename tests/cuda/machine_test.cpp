@@ -99,6 +99,60 @@ TEST_CASE("each mistake of blocks of a cluster is a fault that says what is wron
   });
 }
 
+namespace {
+
+constexpr int kMapColumns = 64;
+/// Rows whose numbers all differ, as bf16 has bits.
+std::vector<std::uint16_t> numbered_rows(int n_row) {
+  std::vector<std::uint16_t> rows(static_cast<std::size_t>(n_row * kMapColumns));
+  for (std::size_t i = 0; i < rows.size(); ++i) rows[i] = static_cast<std::uint16_t>(i + 1);
+  return rows;
+}
+/// The word at an address of shared memory where boxes of such rows begin, the first at a row.
+std::uint32_t word_of_box(const std::vector<std::uint16_t>& rows, std::size_t at, int first_row) {
+  const std::size_t row = at / 128, chunk = at % 128 / 16 ^ row % 8;
+  const std::size_t i = (static_cast<std::size_t>(first_row) + row) * kMapColumns + chunk * 8 + at % 16 / 2;
+  return rows[i] | static_cast<std::uint32_t>(rows[i + 1]) << 16;
+}
+
+}  // namespace
+
+TEST_CASE("copies that mbarriers count: each mistake is a fault, whenever copies arrive") {
+  if (runs_ptx()) return;
+  using Job = vla::cuda::MisbehaveCopyJob;
+  constexpr int kRows = 2 * Job::kBoxRows * Job::kRounds;
+  const std::vector<std::uint16_t> rows = numbered_rows(kRows);
+  const Device<std::uint16_t> x(rows);
+  const Device<unsigned> y(64);
+  const auto fault = [&](Mistake mistake) {
+    const Job job = {map_rows({x.get(), kRows, kMapColumns, kMapColumns, Job::kBoxRows}), mistake, y.get()};
+    return fault_of([&] { launch({"misbehave_with_copies", {1, 1, 2}, 64, 2048 + 16, 2}, job); });
+  };
+  in_every_schedule([&] {
+    CHECK(fault(Mistake::no_mistake_with_mbarriers) == "");
+    for (std::size_t i = 0; i < 64; ++i) {
+      std::uint32_t sum = 0;
+      for (int round = 0; round < Job::kRounds; ++round)
+        sum += word_of_box(rows, i % 32 * 64, 2 * round * Job::kBoxRows);
+      REQUIRE(y.host()[i] == sum);
+    }
+    CHECK(contains(fault(Mistake::no_fence_of_mbarriers), "no fence has made visible"));
+    CHECK(!fault(Mistake::no_barrier_after_begin).empty());  // as threads come: not begun, or not visible
+    // As threads come: what a copy brings is read too early, or written while it is read, or a phase ends too early.
+    for (const Mistake mistake : {Mistake::no_wait_for_copies, Mistake::wait_for_other_parity,
+                                  Mistake::nothing_expected, Mistake::too_few_bytes, Mistake::no_wait_for_readers,
+                                  Mistake::arrival_before_read, Mistake::arrival_too_often})
+      CHECK_MESSAGE(!fault(mistake).empty(), static_cast<int>(mistake));
+    CHECK(contains(fault(Mistake::too_many_bytes), "never comes"));
+    CHECK(contains(fault(Mistake::copy_to_one_block), "never comes"));
+    CHECK(contains(fault(Mistake::arrival_without_warp_barrier), "a bulk copy writes what a thread reads"));
+    CHECK(contains(fault(Mistake::arrival_at_one_block), "never comes"));
+    CHECK(contains(fault(Mistake::end_without_others), "ended") !=
+          contains(fault(Mistake::end_without_others), "ends while another block"));
+    CHECK(contains(fault(Mistake::nobody_waits), "nobody has waited for"));
+  });
+}
+
 TEST_CASE("a launch that a device would refuse is refused") {
   if (runs_ptx()) return;
   const int job = 0;
@@ -219,6 +273,89 @@ TEST_CASE("PTX: blocks of a cluster read each other's shared memory between its 
   CHECK(contains(fault(meet + "ld.shared::cluster.u32 %r3, [%r2];\n" + leave), "mapa has not made"));
   CHECK(contains(fault("mov.u32 %r4, 2;\nmapa.shared::cluster.u32 %r6, %r2, %r4;\n"), "no such block"));
   CHECK(contains(fault(write + meet + "ld.shared::cluster.u32 %r3, [%r6+512];\n"), "not in shared memory"));
+}
+
+TEST_CASE("PTX: a copy of a box is swizzled, has zeros outside of the rows, and is read once its mbarrier says so") {
+  constexpr int kRows = 12, kDepth = 61;
+  const std::vector<std::uint16_t> rows = numbered_rows(kRows);
+  const Device<std::uint16_t> x(rows);
+  struct alignas(64) Job {
+    vla::cuda::TensorMap map;
+    std::uint32_t* y;
+  };
+  const std::string
+      begin =
+          "ld.param.u64 %rd1, [k_param_0+128];\nmov.b64 %rd4, k_param_0;\ncvta.param.u64 %rd4, %rd4;\n"
+          "mov.u32 %r1, %tid.x;\nmov.u32 %r8, room;\nshl.b32 %r2, %r1, 2;\nadd.s32 %r2, %r2, %r8;\n"
+          "mul.wide.u32 %rd2, %r1, 4;\nadd.s64 %rd3, %rd1, %rd2;\nadd.s32 %r7, %r8, 2048;\nmov.u32 %r9, 0;\n"
+          "setp.eq.s32 %p1, %r1, 0;\n",
+      init = "@%p1 mbarrier.init.shared::cta.b64 [%r7], 1;\n", fence = "@%p1 fence.mbarrier_init.release.cluster;\n",
+      barrier = "bar.sync 0;\n",
+      copy =
+          "@%p1 cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes [%r8], "
+          "[%rd4, {%r5, %r6}], [%r7];\n",
+      wait = "$wait:\nmbarrier.try_wait.parity.shared::cta.b64 %p2, [%r7], %r9;\n@!%p2 bra $wait;\n",
+      read = "ld.shared.u32 %r4, [%r2];\nst.global.u32 [%rd3], %r4;\n";
+  const auto expect = [](int n_byte) {
+    return "@%p1 mbarrier.arrive.expect_tx.shared::cta.b64 _, [%r7], " + std::to_string(n_byte) + ";\n";
+  };
+  const auto at = [](int column, int row) {
+    return "mov.u32 %r5, " + std::to_string(column) + ";\nmov.u32 %r6, " + std::to_string(row) + ";\n";
+  };
+  const Device<std::uint32_t> y(256);
+  const auto run = [&](const std::string& body) {
+    const PtxModule module(
+        ".version 9.0\n.target sm_80\n.address_size 64\n.extern .shared .align 16 .b8 room[];\n"
+        ".visible .entry k(\n.param .align 64 .b8 k_param_0[192]\n)\n{\n.reg .pred %p<4>;\n.reg .b32 %r<10>;\n"
+        ".reg .b64 %rd<6>;\n" +
+        begin + body + "\nret;\n}\n");
+    const Job job = {map_rows({x.get(), kRows, kDepth, kMapColumns, 8}), y.get()};
+    device_memory().begin_launch();
+    run_ptx(*module.find("k"), {1, 1, 1}, 256, 2048 + 8, &job);
+  };
+  const auto fault = [&](const std::string& body) { return fault_of([&] { run(body); }); };
+  const std::string begun = init + fence + barrier + at(0, 0);
+  in_every_schedule([&] {
+    for (const auto& [column, row] : {std::pair{0, 0}, {0, 8}, {8, 4}, {-8, -4}, {64, 0}, {0, 12}}) {
+      run(init + fence + barrier + at(column, row) + expect(1024) + copy + wait + read);
+      const std::vector<std::uint32_t> found = y.host();
+      for (int i = 0; i < 512; ++i) {
+        const int box_row = i / 64, k = column + ((i % 64 / 8) ^ box_row) * 8 + i % 8, r = row + box_row;
+        const bool is_inside = k >= 0 && k < kDepth && r >= 0 && r < kRows;
+        const std::uint32_t half = found[static_cast<std::size_t>(i / 2)] >> i % 2 * 16 & 0xffff;
+        REQUIRE(half == (is_inside ? rows[static_cast<std::size_t>(r * kMapColumns + k)] : 0));
+      }
+    }
+    // As warps come: read too early, written while it is read, or a phase that never comes.
+    CHECK(!fault(begun + expect(1024) + copy + read + wait).empty());
+    CHECK(!fault(begun + "mov.u32 %r9, 1;\n" + expect(1024) + copy + wait + read).empty());
+    CHECK(contains(fault(begun + expect(1040) + copy + wait + read), "never comes"));
+    CHECK(contains(fault(begun + expect(1008) + copy + wait + read), "never comes"));
+    CHECK(contains(fault(begun + copy + wait + read), "never comes"));
+    CHECK(contains(fault(begun + expect(1024) + copy), "nobody has waited for"));
+    CHECK(contains(fault(begun + expect(1024) + copy + wait + read + expect(1024) + copy + "mov.u32 %r9, 1;\n" +
+                         "$again:\nmbarrier.try_wait.parity.shared::cta.b64 %p2, [%r7], %r9;\n@!%p2 bra $again;\n"),
+                   "a bulk copy writes what a thread reads"));
+  });
+  CHECK(contains(fault(begun + expect(1024) + copy + read + wait), "has not waited"));
+  CHECK(fault(begun + expect(1024) + copy + wait + read + barrier + expect(1024) + copy + "mov.u32 %r9, 1;\n" +
+              "$again:\nmbarrier.try_wait.parity.shared::cta.b64 %p2, [%r7], %r9;\n@!%p2 bra $again;\n") == "");
+  CHECK(contains(fault(init + barrier + at(0, 0) + expect(1024) + copy + wait), "no fence has made visible to copies"));
+  CHECK(
+      contains(fault(init + fence + at(0, 0) + expect(1024) + copy + wait), "an mbarrier that another thread begins"));
+  CHECK(contains(fault(begun + init), "as plain memory"));
+  CHECK(contains(fault(begun + "st.shared.u32 [%r7+4], %r1;\n"), "as plain memory"));
+  CHECK(contains(fault(at(0, 0) + expect(1024)), "no mbarrier has begun there"));
+  CHECK(contains(fault(begun + expect(0) + expect(0) + "mov.u32 %r9, 2;\n" + wait), "neither 0 nor 1"));
+  CHECK(contains(fault(begun + expect(16) + expect(0)), "more often than it counts"));
+  CHECK(contains(fault(begun + expect(1 << 20)), "more bytes than an mbarrier counts"));
+  CHECK(contains(fault(begun + "add.s64 %rd4, %rd4, 8;\n" + copy), "a tensor map that is not aligned"));
+  CHECK(contains(fault(begun + "add.s64 %rd4, %rd4, 64;\n" + copy), "no tensor map that a driver has made"));
+  CHECK(contains(fault(begun + "add.s32 %r8, %r8, 64;\n" + copy), "an address that is not aligned"));
+  CHECK(contains(fault("@%p1 st.shared.u32 [%r8], %r1;\n" + begun + expect(1024) + copy + wait),
+                 "without fence.proxy.async"));
+  CHECK(fault("@%p1 st.shared.u32 [%r8], %r1;\nfence.proxy.async.shared::cta;\n" + begun + expect(1024) + copy +
+              wait) == "");
 }
 
 TEST_CASE("PTX: products of a warpgroup whose operands or sums are not ready, or touched too early") {

@@ -417,6 +417,7 @@ TESTS = {
     "linear_f32": "*linear_float_test*",
     "hopper_linear_bf16": "*hopper_linear_test*,*halved_norm_test*",
     "hopper_linear_int8": "*linear_int8_test*",
+    "hopper_tma_bf16": "*hopper_tma_test*",
     "hopper_attention": "*/attention_test*",
     "attention": "*/attention_test*",
     "attention_f32": "*/attention_test*",

@@ -31,7 +31,7 @@ def outcome(name, ptx, folder):
 
 
 def test_every_mistake_in_a_kernel_is_seen(ptx, tmp_path):
-    names = list(MISTAKES)[:: 1 if os.environ.get("VLA_ALL_MISTAKES") else 36]
+    names = list(MISTAKES)[:: 1 if os.environ.get("VLA_ALL_MISTAKES") else 41]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         seen = dict(zip(names, pool.map(lambda name: outcome(name, ptx, tmp_path / str(names.index(name))), names)))
     for name, output in seen.items():

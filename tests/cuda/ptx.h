@@ -78,7 +78,7 @@ constexpr const char* kSpecials[] = {"%tid.x",    "%ctaid.x",  "%ctaid.y",  "%ct
                                      "%nctaid.x", "%nctaid.y", "%nctaid.z", "%laneid"};
 
 /// An operation of the table: its operands' types in order, d for 4 bytes (also of 16-bit numbers), q for 8, p for a
-/// predicate, s and g for addresses in shared and global memory.
+/// predicate, s and g for addresses in shared and global memory, _ where there is no result.
 struct PtxOperation {
   const char* name;
   const char* operands;
@@ -88,6 +88,8 @@ struct PtxOperation {
 const PtxOperation* find_operation(const std::string& name);
 /// The product of a wgmma, and what runs it; null for others.
 void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, const PtxInstruction&);
+/// What copies a box of a tensor map, to this block or also to others; null for others.
+void (*find_box_copy(const std::string& name, bool& has_mask))(WarpState&, const PtxInstruction&);
 /// Loads (ld) and stores (st) of param, shared and global, and loads of shared::cluster; null for others.
 void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&);
 

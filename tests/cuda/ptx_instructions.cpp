@@ -10,6 +10,7 @@
 #include "cuda/fault.h"
 #include "cuda/fragments.h"
 #include "cuda/ptx_warp.h"
+#include "cuda/tensor_map.h"
 
 namespace vla::test::cuda {
 
@@ -90,8 +91,9 @@ std::byte* global(WarpState& w, const PtxInstruction& i, int which, int lane, st
     fault_at(w, i, lane, "does not wait for earlier kernels");
   return reinterpret_cast<std::byte*>(p);
 }
-std::size_t in_shared(WarpState& w, const PtxInstruction& i, int lane) {
-  return static_cast<u32>(w.lanes<u32>(i.operand[0])[lane] + static_cast<u32>(i.offset[0]));
+/// An address in shared memory that is an operand, the first if none is named.
+std::size_t in_shared(WarpState& w, const PtxInstruction& i, int lane, int which = 0) {
+  return static_cast<u32>(w.lanes<u32>(i.operand[which])[lane] + static_cast<u32>(i.offset[0]));
 }
 
 void load_value(WarpState& w, const PtxInstruction& i, int lane, const std::byte* from) {
@@ -161,15 +163,20 @@ void map_to_block(WarpState& w, const PtxInstruction& i) {
     w.lanes<u32>(i.operand[0])[l] = (rank[l] + 1) << kRankAt | address[l];
   });
 }
+SharedMemory& block_of(const WarpState& w, const PtxInstruction& i, int lane, std::size_t address) {
+  const std::size_t block = address >> kRankAt;
+  if (block == 0 || block > w.cluster.size()) fault_at(w, i, lane, "address that mapa has not made");
+  return *w.cluster[block - 1];
+}
+std::size_t within_block(std::size_t address) { return address & ((std::size_t{1} << kRankAt) - 1); }
 void load_of_cluster(WarpState& w, const PtxInstruction& i) {
   std::size_t offsets[kWarp];
   std::fill(offsets, offsets + kWarp, SharedMemory::kNone);
   const std::size_t size = access_size(i);
   each_lane(w.active, [&](int l) {
-    const std::size_t address = in_shared(w, i, l), block = address >> kRankAt;
-    if (block == 0 || block > w.cluster.size()) fault_at(w, i, l, "address that mapa has not made");
-    SharedMemory& of = *w.cluster[block - 1];
-    const std::size_t at = offsets[l] = address & ((std::size_t{1} << kRankAt) - 1);
+    const std::size_t address = in_shared(w, i, l);
+    SharedMemory& of = block_of(w, i, l, address);
+    const std::size_t at = offsets[l] = within_block(address);
     guarded(w, i, l, [&] { &of == w.shared ? of.read(at, size, w.thread(l)) : of.read_by_other(at, size); });
     load_value(w, i, l, of.data() + at);
   });
@@ -192,6 +199,74 @@ void copy_async(WarpState& w, const PtxInstruction& i) {
     }
     guarded(w, i, l, [&] { w.shared->copy(in_shared(w, i, l), from, sizes[l], w.thread(l)); });
   });
+}
+
+// mbarriers, and copies that they count
+
+void begin_mbarrier(WarpState& w, const PtxInstruction& i) {
+  each_lane(w.active, [&](int l) {
+    const auto n_arrival = w.lanes<i32>(i.operand[1])[l];
+    guarded(w, i, l, [&] { w.shared->begin_mbarrier(in_shared(w, i, l), n_arrival, w.thread(l)); });
+  });
+}
+template <bool kExpects>
+void arrive(WarpState& w, const PtxInstruction& i) {
+  each_lane(w.active, [&](int l) {
+    const u32 n_byte = kExpects ? w.lanes<u32>(i.operand[1])[l] : 0;
+    guarded(w, i, l, [&] { w.shared->arrive(in_shared(w, i, l), n_byte, *w.shared, w.thread(l)); });
+  });
+}
+void arrive_at_block(WarpState& w, const PtxInstruction& i) {
+  each_lane(w.active, [&](int l) {
+    const std::size_t address = in_shared(w, i, l);
+    SharedMemory& of = block_of(w, i, l, address);
+    guarded(w, i, l, [&] { of.arrive(within_block(address), 0, *w.shared, w.thread(l)); });
+  });
+}
+/// A warp that waits lets others go on before it looks again.
+void try_wait(WarpState& w, const PtxInstruction& i) {
+  u32 ended = 0;
+  each_lane(w.active, [&](int l) {
+    const u32 parity = w.lanes<u32>(i.operand[2])[l];
+    guarded(w, i, l, [&] {
+      if (parity > 1) throw Fault("a parity that is neither 0 nor 1");
+      ended |= static_cast<u32>(w.shared->try_wait(in_shared(w, i, l, 1), parity, w.thread(l))) << l;
+    });
+  });
+  u32& to = w.mask(i.operand[0]);
+  to = (to & ~w.active) | ended;
+  w.waits_for_phase = ended != w.active;
+}
+/// The address of a parameter as one that any instruction takes: the host's.
+void address_of_param(WarpState& w, const PtxInstruction& i) {
+  each_lane(w.active, [&](int l) {
+    w.lanes<u64>(i.operand[0])[l] = reinterpret_cast<u64>(w.job) + w.lanes<u64>(i.operand[1])[l];
+  });
+}
+template <bool kHasMask>
+void run_box_copy(WarpState& w, const PtxInstruction& i) {
+  const auto copy = [&](int l) {
+    const u64 map = w.lanes<u64>(i.operand[1])[l] - reinterpret_cast<u64>(w.job);
+    if (map + sizeof(vla::cuda::TensorMap) > w.job_size) throw Fault("a tensor map that is not in the parameter");
+    if (map % alignof(vla::cuda::TensorMap) != 0) throw Fault("a tensor map that is not aligned");
+    const std::size_t to = w.lanes<u32>(i.operand[0])[l], mbarrier = w.lanes<u32>(i.operand[4])[l];
+    const auto read = [&](std::uintptr_t from, std::size_t size) {
+      i.hint = device_memory().check(from, size, false, fresh_hint(i));
+      if (w.early >> l & 1 && device_memory().has_result(*i.hint, from, size))
+        throw Fault("does not wait for earlier kernels");
+      return reinterpret_cast<const std::byte*>(from);
+    };
+    const std::vector<std::byte> box =
+        copy_box(w.job + map, w.lanes<i32>(i.operand[2])[l], w.lanes<i32>(i.operand[3])[l], to, read);
+    if (!kHasMask) return w.shared->bulk_copy(to, box, mbarrier, *w.shared, w.thread(l));
+    const u32 blocks = w.lanes<u32>(i.operand[5])[l] & 0xffff;
+    for (std::size_t rank = 0; blocks >> rank != 0; ++rank) {
+      if ((blocks >> rank & 1) == 0) continue;
+      if (rank >= w.cluster.size()) throw Fault("the cluster has no such block");
+      w.cluster[rank]->bulk_copy(to, box, mbarrier, *w.shared, w.thread(l));
+    }
+  };
+  each_lane(w.active, [&](int l) { guarded(w, i, l, [&] { copy(l); }); });
 }
 
 // All lanes together
@@ -422,6 +497,15 @@ const PtxOperation kOperations[] = {
     {"fence.proxy.async.shared::cta", "",
      [](WarpState& w,
         const PtxInstruction&) { each_lane(w.active, [&](int l) { w.shared->fence_async(w.thread(l)); }); }},
+    {"mbarrier.init.shared::cta.b64", "sd", begin_mbarrier},
+    {"fence.mbarrier_init.release.cluster", "",
+     [](WarpState& w,
+        const PtxInstruction&) { each_lane(w.active, [&](int l) { w.shared->fence_mbarriers(w.thread(l)); }); }},
+    {"mbarrier.arrive.shared::cta.b64", "_s", arrive<false>},
+    {"mbarrier.arrive.expect_tx.shared::cta.b64", "_sd", arrive<true>},
+    {"mbarrier.arrive.shared::cluster.b64", "_s", arrive_at_block},
+    {"mbarrier.try_wait.parity.shared::cta.b64", "psd", try_wait},
+    {"cvta.param.u64", "qq", address_of_param},
     {"wgmma.fence.sync.aligned", "", [](WarpState& w, const PtxInstruction&) { w.wgmma.fence(); },
      PtxInstruction::kWarp},
     {"wgmma.commit_group.sync.aligned", "", [](WarpState& w, const PtxInstruction&) { w.wgmma.commit(); },
@@ -481,6 +565,13 @@ void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, c
   if (shape != "k16.f32.bf16.bf16" && shape != "k32.s32.s8.s8") return nullptr;
   product.kind = shape[1] == '1' ? WgmmaProduct::bf16 : WgmmaProduct::s8;
   return wgmma;
+}
+
+void (*find_box_copy(const std::string& name, bool& has_mask))(WarpState&, const PtxInstruction&) {
+  const std::string own = "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes";
+  has_mask = name != own;
+  if (!has_mask) return run_box_copy<false>;
+  return name == own + ".multicast::cluster" ? run_box_copy<true> : nullptr;
 }
 
 void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&) {

@@ -219,6 +219,7 @@ class Reader {
     }
     if (starts_with(name, "ld.") || starts_with(name, "st.")) return decode_access(one, name, operands);
     if (starts_with(name, "wgmma.mma_async.")) return decode_wgmma(one, name, operands);
+    if (starts_with(name, "cp.async.bulk.tensor.")) return decode_box_copy(one, name, operands);
     one.is_move = name == "mov.f32" || name == "mov.b32" || name == "mov.u32";
     const PtxOperation* operation = find_operation(name);
     if (starts_with(name, "cvt.") && operation != nullptr && operation->operands[1] == 'd')
@@ -233,6 +234,8 @@ class Reader {
       if (types[i] == 's' || types[i] == 'g') {  // an address in shared or global memory
         address(one, operands[i], n_address++);
         if (wide_ != (types[i] == 'g')) throw Fault("an address of another width");
+      } else if (types[i] == '_') {
+        if (operands[i] != "_") throw Fault("a result that is not known");
       } else {
         one.operand[one.n_operand++] = operand(operands[i], types[i]);
       }
@@ -251,6 +254,19 @@ class Reader {
       throw Fault("wgmma that negates or transposes");
     for (std::size_t i = 0; i < n_sum; ++i) one.sums.push_back(operand(operands[i], 'd'));
     for (std::size_t i = 0; i < 3; ++i) one.operand[one.n_operand++] = operand(operands[n_sum + i], "qqp"[i]);
+  }
+
+  /// [to], [map, {column, row}], [mbarrier] and perhaps the mask of blocks.
+  void decode_box_copy(PtxInstruction& one, const std::string& name, const std::vector<std::string>& operands) {
+    bool has_mask = false;
+    one.run = find_box_copy(name, has_mask);
+    if (one.run == nullptr) throw Fault("unknown instruction " + name);
+    if (operands.size() != (has_mask ? 6U : 5U)) throw Fault("another number of operands");
+    for (std::size_t i = 0; i < operands.size(); ++i) {
+      std::string word = operands[i];
+      std::erase_if(word, [](char c) { return c == '[' || c == ']'; });
+      one.operand[one.n_operand++] = operand(word, "dqdddd"[i]);
+    }
   }
 
   void decode_access(PtxInstruction& one, const std::string& name, std::vector<std::string> operands) {

@@ -36,8 +36,9 @@ u32 next_group(WarpState& w) {
 /// More instructions than any warp of the tests needs.
 constexpr long kForever = 50'000'000;
 
-/// Where a warp or a block has stopped: at its end, or at a barrier of the block or of the cluster.
-enum class Stop { none, end, barrier, cluster };
+/// Where a warp or a block has stopped: at its end, at a barrier of the block or of the cluster, or at an mbarrier,
+/// where it looks again at its next turn.
+using Stop = WarpState::Stop;
 
 /// Runs a warp until it stops.
 Stop run_warp(WarpState& w, const PtxKernel& kernel) {
@@ -85,11 +86,12 @@ Stop run_warp(WarpState& w, const PtxKernel& kernel) {
     const u32 stay = group & ~jumps & w.live;
     if (w.together && (jumps == 0 || stay == 0)) {
       w.pc = jumps != 0 ? i.target : next;
-      continue;
+    } else {
+      w.together = false;
+      for (int l = 0; l < kWarp; ++l)
+        if (group >> l & 1) w.pcs[l] = jumps >> l & 1 ? i.target : next;
     }
-    if (w.together) w.together = false;
-    for (int l = 0; l < kWarp; ++l)
-      if (group >> l & 1) w.pcs[l] = jumps >> l & 1 ? i.target : next;
+    if (std::exchange(w.waits_for_phase, false)) return Stop::mbarrier;
   }
   return Stop::end;
 }
@@ -122,7 +124,7 @@ void begin_block(const Cluster& cluster, Block& block, BlockIndex at, std::size_
   const unsigned n_thread = cluster.n_thread;
   const std::size_t dynamic = (kernel.static_shared + 1023) / 1024 * 1024;
   SharedMemory& shared = block.shared;
-  shared.begin(dynamic + n_shared, static_cast<int>(n_thread));
+  shared.begin(dynamic + n_shared, static_cast<int>(n_thread), at.z % grid.cluster);
   block.at = at, block.number = device_memory().begin_block(), block.stop = Stop::none;
   block.warps.resize(n_thread / kWarp), block.order.clear();
   for (std::size_t i = 0; i < block.warps.size(); ++i) {
@@ -131,6 +133,7 @@ void begin_block(const Cluster& cluster, Block& block, BlockIndex at, std::size_
     w.live = kAll, w.waits = 0, w.early = kernel.overlaps ? kAll : 0, w.together = true, w.pc = 0, w.n_done = 0;
     w.number = static_cast<int>(i), w.job = static_cast<const std::byte*>(job), w.job_size = kernel.param_size;
     w.shared = &shared, w.cluster = cluster.shared, w.arrival = WarpState::kAway;
+    w.stop = Stop::none, w.waits_for_phase = false;
     w.wgmma.begin(shared, w.number), w.in_flight.clear(), w.sums.clear();
     w.registers.resize(kernel.register_bytes);
     std::copy(kernel.constants.begin(), kernel.constants.end(), w.registers.begin());
@@ -149,20 +152,26 @@ void begin_block(const Cluster& cluster, Block& block, BlockIndex at, std::size_
   }
 }
 
-/// Runs a block until all its warps have stopped.
+/// Runs a block until all its warps have stopped. Those that wait for an mbarrier have a turn each.
 void run_block(Cluster& cluster, Block& block) {
   cluster.at = block.at;
   device_memory().go_on(block.number);
   if (schedule.seed) std::shuffle(block.order.begin(), block.order.end(), cluster.random);
-  block.stop = Stop::none;
+  bool waits_for_phase = false;
   for (WarpState* w : block.order) {
-    const Stop stop = run_warp(*w, cluster.kernel);
-    if (block.stop != Stop::none && stop != block.stop)
-      throw Fault(stop == Stop::end || block.stop == Stop::end ? "some threads end while others wait at a barrier"
-                                                               : "threads of a block wait at different barriers");
-    block.stop = stop;
+    if (w->stop == Stop::none || w->stop == Stop::mbarrier) w->stop = run_warp(*w, cluster.kernel);
+    waits_for_phase |= w->stop == Stop::mbarrier;
   }
-  if (block.stop == Stop::barrier) block.shared.barrier(), ++counts.barriers;
+  block.stop = waits_for_phase ? Stop::mbarrier : block.order[0]->stop;
+  if (waits_for_phase) return;
+  for (const WarpState* w : block.order)
+    if (w->stop != block.stop)
+      throw Fault(w->stop == Stop::end || block.stop == Stop::end ? "some threads end while others wait at a barrier"
+                                                                  : "threads of a block wait at different barriers");
+  if (block.stop == Stop::barrier) {
+    block.shared.barrier(), ++counts.barriers;
+    for (WarpState& w : block.warps) w.stop = Stop::none;
+  }
   if (block.stop != Stop::end) return;
   std::vector<const Wgmma*> products;
   for (const WarpState& w : block.warps) products.push_back(&w.wgmma);
@@ -174,7 +183,10 @@ void run_block(Cluster& cluster, Block& block) {
 void meet(Cluster& cluster) {
   bool releases = true;
   for (Block& block : cluster.blocks)
-    for (WarpState& w : block.warps) releases &= std::exchange(w.arrival, WarpState::kAway) == WarpState::kReleased;
+    for (WarpState& w : block.warps) {
+      releases &= std::exchange(w.arrival, WarpState::kAway) == WarpState::kReleased;
+      w.stop = Stop::none;
+    }
   for (Block& block : cluster.blocks) block.shared.cluster_barrier(releases), block.stop = Stop::none;
 }
 
@@ -184,15 +196,26 @@ void run_cluster(Cluster& cluster) {
   const auto stands = [&](Stop stop) {
     return std::ranges::count(turns, stop, &Block::stop) == static_cast<std::ptrdiff_t>(turns.size());
   };
+  const auto n_change = [&] {
+    std::uint64_t n = 0;
+    for (const SharedMemory* shared : cluster.shared) n += shared->n_change();
+    return n;
+  };
   while (!stands(Stop::end)) {
     if (schedule.seed) std::shuffle(turns.begin(), turns.end(), cluster.random);
-    bool goes_on = false;
-    for (Block* block : turns)
-      if (block->stop != Stop::end && block->stop != Stop::cluster) run_block(cluster, *block), goes_on = true;
+    const std::uint64_t before = n_change();
+    bool goes_on = false, waits_for_phase = false;
+    for (Block* block : turns) {
+      if (block->stop == Stop::end || block->stop == Stop::cluster) continue;
+      run_block(cluster, *block);
+      (block->stop == Stop::mbarrier ? waits_for_phase : goes_on) = true;
+    }
     if (stands(Stop::cluster))
       meet(cluster);
-    else if (!goes_on)
+    else if (!goes_on && !waits_for_phase)
       throw Fault("some blocks end while others wait at a barrier of the cluster");
+    else if (!goes_on && n_change() == before && !SharedMemory::bring_one(cluster.shared, cluster.random))
+      throw Fault("waits for a phase of an mbarrier that never comes");
   }
 }
 

@@ -39,6 +39,8 @@ struct WarpState {
   SharedMemory* shared = nullptr;
   std::span<SharedMemory* const> cluster;               // shared memory of its blocks
   enum { kAway, kRelaxed, kReleased } arrival = kAway;  // at a barrier of the cluster
+  enum class Stop { none, end, barrier, cluster, mbarrier } stop = Stop::none;
+  bool waits_for_phase = false;  // a phase of an mbarrier has not ended yet
   Wgmma wgmma;
   std::list<WgmmaSums> sums;                                    // in flight
   std::map<u32, std::pair<WgmmaSums*, std::size_t>> in_flight;  // registers of such sums

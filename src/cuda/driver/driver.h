@@ -70,7 +70,10 @@ struct LaunchConfig {
   CALL(graph_instantiate, cuGraphInstantiateWithFlags, Handle* executable, Handle graph, std::uint64_t flags)  \
   CALL(graph_launch, cuGraphLaunch, Handle executable, Handle stream)                                          \
   CALL(graph_destroy, cuGraphDestroy, Handle graph)                                                            \
-  CALL(executable_destroy, cuGraphExecDestroy, Handle executable)
+  CALL(executable_destroy, cuGraphExecDestroy, Handle executable)                                              \
+  CALL(tensor_map, cuTensorMapEncodeTiled, void* map, int type, unsigned n_dimension, void* address,           \
+       const std::uint64_t* sizes, const std::uint64_t* strides, const unsigned* box, const unsigned* steps,   \
+       int interleave, int swizzle, int promotion, int fill)
 
 struct Driver {
 #define VLA_CUDA_CALL(name, symbol, ...) int (*name)(__VA_ARGS__) = nullptr;

@@ -9,6 +9,7 @@
 
 #include "cuda/driver/driver.h"
 #include "cuda/kernels/launch.h"
+#include "cuda/kernels/tensor_map.h"
 
 /// A device and its resources. A driver failure is an Error that names the call: out_of_memory if the driver reports
 /// that, else device. Resources are released once; failures while releasing are ignored.
@@ -105,6 +106,10 @@ struct GpuInfo {
 /// `found`.
 Result<std::vector<GpuInfo>> list_gpus(const Driver& driver);
 
+/// A map for copies of boxes of box_rows rows and 128 bytes of the depth, swizzled as wgmma takes them (hopper.h). What
+/// is outside of the rows and the depth is zeros. Nothing is read; the rows need not be there yet.
+Result<TensorMap> map_rows(const Driver& driver, const MappedRows& of);
+
 class Gpu {
  public:
   /// Driver version and compute capability that our kernels need.
@@ -137,6 +142,8 @@ class Gpu {
   /// Pinned host memory, which the device reads and writes without the processor.
   Result<Owned> allocate_host(std::size_t size);
   Result<Stream> stream();
+  /// For Hopper, see above.
+  Result<TensorMap> map_rows(const MappedRows& of) const { return cuda::map_rows(driver_, of); }
   /// Creates an event: with time for Stream::note_time, without for Stream::record.
   Result<Owned> event(bool has_time);
   /// Milliseconds between two recorded events.

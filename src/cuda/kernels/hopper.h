@@ -3,10 +3,11 @@
 #pragma once
 
 #include "cuda/kernels/device.h"
+#include "cuda/kernels/tensor_map.h"
 
-/// Products of a warpgroup (four consecutive warps from a multiple of four on) and clusters of blocks, for files that
-/// are compiled only for sm_90a. For the host's compiler tests/cuda/emulation.h has the same functions. Source: PTX
-/// ISA 9.0, "Asynchronous Warpgroup Level Matrix Multiply-Accumulate Instructions".
+/// Products of a warpgroup (four consecutive warps from a multiple of four on), clusters of blocks, mbarriers and
+/// copies that they count, for files that are compiled only for sm_90a. For the host's compiler tests/cuda/emulation.h
+/// has the same functions. Source: PTX ISA 9.0, "Asynchronous Warpgroup Level Matrix Multiply-Accumulate Instructions".
 #ifdef __CUDACC__
 
 namespace vla::cuda::dev {
@@ -33,6 +34,59 @@ VLA_DEVICE uint4 read_of_block(const std::byte* p, int rank) {
                : "r"(from)
                : "memory");
   return to;
+}
+
+/// An mbarrier takes 8 bytes of shared memory. A phase of it ends after n_arrival arrivals and as many bytes as these
+/// expect.
+VLA_DEVICE void begin_mbarrier(std::byte* mbarrier, int n_arrival) {
+  asm volatile("mbarrier.init.shared::cta.b64 [%0], %1;" ::"r"(shared_address(mbarrier)), "r"(n_arrival) : "memory");
+}
+/// Makes the mbarriers that this thread has begun visible to copies, and after a barrier to the cluster's threads.
+VLA_DEVICE void fence_mbarriers() { asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory"); }
+VLA_DEVICE void arrive(std::byte* mbarrier) {
+  asm volatile("mbarrier.arrive.shared::cta.b64 _, [%0];" ::"r"(shared_address(mbarrier)) : "memory");
+}
+/// Arrives, and lets the phase expect n_byte of copies.
+VLA_DEVICE void arrive_expecting(std::byte* mbarrier, int n_byte) {
+  asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(shared_address(mbarrier)), "r"(n_byte)
+               : "memory");
+}
+/// Arrives at the mbarrier that block `rank` of the cluster has where this block has one: to say that wgmma has read a
+/// stage. What threads wrote it makes visible to the own block alone, as more would cost a MEMBAR.GPU.
+VLA_DEVICE void arrive_at_block(std::byte* mbarrier, int rank) {
+  unsigned of_block;
+  asm("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(of_block) : "r"(shared_address(mbarrier)), "r"(rank));
+  asm volatile("mbarrier.arrive.shared::cluster.b64 _, [%0];" ::"r"(of_block) : "memory");
+}
+/// Waits until the phase of this parity has ended; phases are numbered from 0. Parity 1 has ended at first.
+VLA_DEVICE void wait_mbarrier(std::byte* mbarrier, unsigned parity) {
+  int has_ended;
+  do {
+    asm volatile(
+        "{\n.reg .pred ended;\nmbarrier.try_wait.parity.shared::cta.b64 ended, [%1], %2;\n"
+        "selp.s32 %0, 1, 0, ended;\n}"
+        : "=r"(has_ended)
+        : "r"(shared_address(mbarrier)), "r"(parity)
+        : "memory");
+  } while (has_ended == 0);
+}
+/// Copies a box of the map's rows, from (column, row) on, to shared memory; zeros where there are no rows or columns.
+/// An mbarrier's phase gets the box's bytes when they are there.
+VLA_DEVICE void copy_box(std::byte* to, const TensorMap& map, int column, int row, std::byte* mbarrier) {
+  asm volatile(
+      "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3}], [%4];" ::"r"(
+          shared_address(to)),
+      "l"(&map), "r"(column), "r"(row), "r"(shared_address(mbarrier))
+      : "memory");
+}
+/// The same to those blocks of the cluster whose bits are set, each with its own mbarrier.
+VLA_DEVICE void copy_box_to_blocks(std::byte* to, const TensorMap& map, int column, int row, std::byte* mbarrier,
+                                   unsigned blocks) {
+  asm volatile(
+      "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster"
+      " [%0], [%1, {%2, %3}], [%4], %5;" ::"r"(shared_address(to)),
+      "l"(&map), "r"(column), "r"(row), "r"(shared_address(mbarrier)), "h"(static_cast<unsigned short>(blocks))
+      : "memory");
 }
 
 /// Must precede the first wgmma, and each wgmma after other instructions have read or written the sums.

@@ -16,27 +16,6 @@ struct Tile {
   static constexpr int kColumnsY = kGated ? kColumns / 2 : kColumns;
 };
 
-/// Ends the norm of x, if there is one. kHalves: 2 if there are columns of a gate.
-template <int kHalves>
-struct EndsNorm {
-  const LinearBf16Job& job;
-  NormedColumns<4> all[kHalves] = {};
-
-  template <class SumsOf>
-  VLA_DEVICE void load(SumsOf sums_of) {
-#pragma unroll
-    for (int half = 0; half < kHalves; ++half)
-      all[half].load(job, [&](int row, float(&to)[4]) {
-        const auto sums = sums_of(row, half > 0);
-#pragma unroll
-        for (int c = 0; c < 4; ++c) to[c] = sums.of[c];
-      });
-  }
-  VLA_DEVICE float operator()(const RowTerms& row, float sum, int c, bool of_gate) const {
-    return all[of_gate ? kHalves - 1 : 0].normed(row, sum, c);
-  }
-};
-
 /// Begins a norm of y.
 struct BeginsNorm {
   static constexpr bool kTakesRows = true;

@@ -93,6 +93,8 @@ class TileEnd {
     else
       leave_rows<1, false>(sums, partial, of_row, word);
   }
+  /// What a warp of the block that has no sums calls in the place of `leave` or of `finish` of an undivided depth.
+  static VLA_DEVICE void attend() { __syncthreads(); }
   /// Computes y from value(of_row(row), a sum, index of the column among the thread's four, whether it is the gate's),
   /// once all threads of the block, or of the cluster, have called it. If value has `load`, that is called before, with
   /// a function that returns four sums of a row, of the gate or not. `then` also gets y, see LeavesY.

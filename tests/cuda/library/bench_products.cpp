@@ -16,6 +16,7 @@
 #include <utility>
 
 #include "base/bf16.h"
+#include "cuda/kernels/hopper_tma.h"
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/kernels/linear_int8.h"
 #include "cuda/library/launch_timer.h"
@@ -126,8 +127,36 @@ class Bench {
         if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
         VLA_CHECK(tell("bf16", size, name, n_split, jobs, launches));
       }
-    if (timer_.gpu().is_hopper() && size.n_row > 32) return run_hopper(size, x, matrices, partial, end);
+    if (!timer_.gpu().is_hopper() || size.n_row <= 32) return {};
+    VLA_CHECK(run_hopper(size, x, matrices, partial, end));
+    return size.depth % 8 == 0 ? run_tma(size, x, matrices, end) : Status();
+  }
+
+  /// Tiles whose operands TMA fetches.
+  Status run_tma(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Epilogue& end) {
+    for (const HopperTmaTile& tile : kHopperTmaTiles) {
+      if (tile.is_gated && size.n_column % 2 != 0) continue;
+      std::vector<HopperTmaJob> jobs;
+      for (const Buffer& matrix : matrices) {
+        LinearBf16Job product = {.x = x.as<void>(), .weight = matrix.as<std::uint16_t>(), .end = end};
+        product.x_stride = product.weight_stride = size.depth, product.depth = size.depth, product.n_split = 1;
+        product.n_row = size.n_row, product.n_column = tile.is_gated ? size.n_column / 2 : size.n_column;
+        if (tile.is_gated) product.gate_weight = product.weight + product.n_column * product.weight_stride;
+        VLA_TRY(const HopperTmaJob job, with_maps(tile, product));
+        jobs.push_back(job);
+      }
+      const std::vector<Launch> launches = {hopper_tma_bf16(tile, jobs[0].product)};
+      VLA_CHECK(tell(tile.is_gated ? "bf16 gated" : "bf16", size, tile.kernel, 1, jobs, launches));
+    }
     return {};
+  }
+  Result<HopperTmaJob> with_maps(const HopperTmaTile& tile, const LinearBf16Job& product) {
+    HopperTmaJob job = {.x = {}, .weight = {}, .gate_weight = {}, .product = product};
+    VLA_TRY(job.x, timer_.gpu().map_rows(mapped_x(tile, product)));
+    VLA_TRY(job.weight, timer_.gpu().map_rows(mapped_weight(tile, product, product.weight)));
+    if (!tile.is_gated) return job;
+    VLA_TRY(job.gate_weight, timer_.gpu().map_rows(mapped_weight(tile, product, product.gate_weight)));
+    return job;
   }
 
   Status run_hopper(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Buffer& partial,

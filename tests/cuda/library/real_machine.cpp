@@ -99,6 +99,12 @@ bool is_hopper() { return machine().gpu->is_hopper(); }
 /// of 8 is several times what is to be expected, and far below what a wrong operand would do.
 double bf16_sum_error(int depth) { return (depth + 7) / 8 * 0x1p-23; }
 
+TensorMap map_rows(const MappedRows& of) {
+  const Result<TensorMap> map = machine().gpu->map_rows(of);
+  if (!map) throw Fault(map.error().message());
+  return *map;
+}
+
 void launch(const Launch& how, const void* job, std::size_t) {
   Machine& m = machine();
   Status status = m.gpu->use();
