@@ -218,14 +218,15 @@ TEST_CASE("rows are mapped for a GPU as its driver takes them, or refused") {
   auto memory = (*gpu)->allocate(4096, "rows");
   REQUIRE(memory);
   const auto* rows = memory->as<std::uint16_t>();
-  CHECK((*gpu)->map_rows({rows, 8, 61, 64, 256}));
+  TensorMap map = {};
+  CHECK((*gpu)->map_rows({rows, 8, 61, 64, 256}, map).ok());
   CHECK(fake_driver().n_call["cuTensorMapEncodeTiled"] == 1);
   for (const MappedRows& refused :
        {MappedRows{rows + 4, 8, 64, 64, 8}, MappedRows{rows, 8, 60, 60, 8}, MappedRows{rows, 8, 72, 64, 8},
         MappedRows{rows, 8, 64, 64, 257}, MappedRows{rows, 8, 64, 64, 0}, MappedRows{rows, 0, 64, 64, 8}}) {
-    const auto map = (*gpu)->map_rows(refused);
-    REQUIRE(!map);
-    CHECK(map.error().message().find("cuda tensor_map: CUDA_ERROR_INVALID_VALUE") != std::string::npos);
+    const Status made = (*gpu)->map_rows(refused, map);
+    REQUIRE(!made.ok());
+    CHECK(made.error().message().find("cuda tensor_map: CUDA_ERROR_INVALID_VALUE") != std::string::npos);
   }
 }
 

@@ -49,9 +49,10 @@ double bf16_sum_error(int) { return 0; }
 std::vector<std::string> modules_of_tests() { return runs_ptx() ? texts() : std::vector<std::string>{kHostModule}; }
 
 vla::cuda::TensorMap map_rows(const vla::cuda::MappedRows& of) {
-  const Result<vla::cuda::TensorMap> map = vla::cuda::map_rows(tensor_map_driver(), of);
-  if (!map) throw Fault(map.error().message());
-  return *map;
+  vla::cuda::TensorMap map = {};
+  const Status made = vla::cuda::map_rows(tensor_map_driver(), of, map);
+  if (!made.ok()) throw Fault(made.error().message());
+  return map;
 }
 
 void launch(const vla::cuda::Launch& how, const void* job, std::size_t job_size) {

@@ -96,17 +96,15 @@ Result<std::vector<GpuInfo>> list_gpus(const Driver& driver) {
   return all;
 }
 
-Result<TensorMap> map_rows(const Driver& driver, const MappedRows& of) {
+Status map_rows(const Driver& driver, const MappedRows& of, TensorMap& map) {
   constexpr int kBf16 = 9, kNoInterleave = 0, kSwizzle128 = 3, kPromote256 = 3, kZeros = 0;
   constexpr unsigned kBoxDepth = 64;  // 128 bytes
   const std::uint64_t sizes[] = {static_cast<std::uint64_t>(of.depth), static_cast<std::uint64_t>(of.n_row)};
   const std::uint64_t strides[] = {static_cast<std::uint64_t>(of.stride) * sizeof(*of.rows)};
   const unsigned box[] = {kBoxDepth, static_cast<unsigned>(of.box_rows)}, steps[] = {1, 1};
-  TensorMap map = {};
-  VLA_CHECK(check_call(driver, "tensor_map",
-                       driver.tensor_map(&map, kBf16, 2, const_cast<std::uint16_t*>(of.rows), sizes, strides, box,
-                                         steps, kNoInterleave, kSwizzle128, kPromote256, kZeros)));
-  return map;
+  return check_call(driver, "tensor_map",
+                    driver.tensor_map(&map, kBf16, 2, const_cast<std::uint16_t*>(of.rows), sizes, strides, box, steps,
+                                      kNoInterleave, kSwizzle128, kPromote256, kZeros));
 }
 
 Status Gpu::check(const char* call, int result) const { return check_call(driver_, call, result); }

@@ -106,9 +106,9 @@ struct GpuInfo {
 /// `found`.
 Result<std::vector<GpuInfo>> list_gpus(const Driver& driver);
 
-/// A map for copies of boxes of box_rows rows and 128 bytes of the depth, swizzled as wgmma takes them (hopper.h). What
-/// is outside of the rows and the depth is zeros. Nothing is read; the rows need not be there yet.
-Result<TensorMap> map_rows(const Driver& driver, const MappedRows& of);
+/// Makes `map` one for copies of boxes of box_rows rows and 128 bytes of the depth, swizzled as wgmma takes them
+/// (hopper.h). What is outside of the rows and the depth is zeros. Nothing is read; the rows need not be there yet.
+Status map_rows(const Driver& driver, const MappedRows& of, TensorMap& map);
 
 class Gpu {
  public:
@@ -143,7 +143,7 @@ class Gpu {
   Result<Owned> allocate_host(std::size_t size);
   Result<Stream> stream();
   /// For Hopper, see above.
-  Result<TensorMap> map_rows(const MappedRows& of) const { return cuda::map_rows(driver_, of); }
+  Status map_rows(const MappedRows& of, TensorMap& map) const { return cuda::map_rows(driver_, of, map); }
   /// Creates an event: with time for Stream::note_time, without for Stream::record.
   Result<Owned> event(bool has_time);
   /// Milliseconds between two recorded events.

@@ -142,21 +142,19 @@ class Bench {
         product.x_stride = product.weight_stride = size.depth, product.depth = size.depth, product.n_split = 1;
         product.n_row = size.n_row, product.n_column = tile.is_gated ? size.n_column / 2 : size.n_column;
         if (tile.is_gated) product.gate_weight = product.weight + product.n_column * product.weight_stride;
-        VLA_TRY(const HopperTmaJob job, with_maps(tile, product));
-        jobs.push_back(job);
+        VLA_CHECK(add_maps(tile, product, jobs.emplace_back()));
       }
       const std::vector<Launch> launches = {hopper_tma_bf16(tile, jobs[0].product)};
       VLA_CHECK(tell(tile.is_gated ? "bf16 gated" : "bf16", size, tile.kernel, 1, jobs, launches));
     }
     return {};
   }
-  Result<HopperTmaJob> with_maps(const HopperTmaTile& tile, const LinearBf16Job& product) {
-    HopperTmaJob job = {.x = {}, .weight = {}, .gate_weight = {}, .product = product};
-    VLA_TRY(job.x, timer_.gpu().map_rows(mapped_x(tile, product)));
-    VLA_TRY(job.weight, timer_.gpu().map_rows(mapped_weight(tile, product, product.weight)));
-    if (!tile.is_gated) return job;
-    VLA_TRY(job.gate_weight, timer_.gpu().map_rows(mapped_weight(tile, product, product.gate_weight)));
-    return job;
+  Status add_maps(const HopperTmaTile& tile, const LinearBf16Job& product, HopperTmaJob& job) {
+    job.product = product;
+    VLA_CHECK(timer_.gpu().map_rows(mapped_x(tile, product), job.x));
+    VLA_CHECK(timer_.gpu().map_rows(mapped_weight(tile, product, product.weight), job.weight));
+    if (!tile.is_gated) return {};
+    return timer_.gpu().map_rows(mapped_weight(tile, product, product.gate_weight), job.gate_weight);
   }
 
   Status run_hopper(const Size& size, const Buffer& x, const std::vector<Buffer>& matrices, const Buffer& partial,
@@ -184,7 +182,10 @@ class Bench {
         VLA_CHECK(tell(tile.is_gated ? "bf16 gated" : "bf16", size, name.c_str(), n_split, jobs, launches));
         if (tile.begins != nullptr && jobs[0].partial == nullptr) {
           for (LinearBf16Job& job : jobs)
-            job.norm_begin = {rows.as<std::uint16_t>(), stride_of_rows, bias.as<float>(), squares.as<float>()};
+            job.norm_begin = {.rows = rows.as<std::uint16_t>(),
+                              .stride = stride_of_rows,
+                              .weight = bias.as<float>(),
+                              .moments = {.squares = squares.as<float>()}};
           launches = {hopper_linear_bf16(tile, jobs[0])};
           VLA_CHECK(tell("bf16, begins norm", size, name.c_str(), n_split, jobs, launches));
           for (LinearBf16Job& job : jobs) job.norm_begin = {};

@@ -100,9 +100,10 @@ bool is_hopper() { return machine().gpu->is_hopper(); }
 double bf16_sum_error(int depth) { return (depth + 7) / 8 * 0x1p-23; }
 
 TensorMap map_rows(const MappedRows& of) {
-  const Result<TensorMap> map = machine().gpu->map_rows(of);
-  if (!map) throw Fault(map.error().message());
-  return *map;
+  TensorMap map = {};
+  const Status made = machine().gpu->map_rows(of, map);
+  if (!made.ok()) throw Fault(made.error().message());
+  return map;
 }
 
 void launch(const Launch& how, const void* job, std::size_t) {
