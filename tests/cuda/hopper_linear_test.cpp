@@ -1,10 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include <algorithm>
 #include <deque>
 
-#include "cuda/kernels/linear_bf16.h"
-#include "cuda/products.h"
+#include "cuda/gated_product.h"
 
 namespace hopper_linear_test {
 
@@ -37,45 +35,29 @@ TEST_CASE("bf16 products in tiles for Hopper are as near to doubles, and shares 
   }
   counts = {};
   for (const ProductCase& c : kHopperCases) {
-    const std::int64_t stride = round_up(c.depth, 8) + 8;
     for (const HopperTile& tile : kHopperTiles) {
-      Operands of(c, true);
-      // What the gate's product is, is the gate of what is expected.
-      Operands gate({c.n_row, c.depth, c.n_column, 1, Activation::none, c.has_bias}, true);
-      if (tile.is_gated) {
-        std::reverse_copy(of.weight.begin(), of.weight.end(), gate.weight.begin());
-        const std::vector<double> made = gate.expected();
-        std::copy(made.begin(), made.end(), of.gate.begin()), of.c.has_gate = true;
-      }
-      const std::vector<double> expected = of.expected();
       INFO(tile.kernel, ", ", c.n_row, " x ", c.depth, " x ", c.n_column);
+      const GatedProduct product(c, tile.is_gated);
+      const std::vector<double> expected = product.expected();
       const auto run = [&](float* shares) {
-        return run_product(of, [&](Epilogue end) {
-          if (tile.is_gated) end.gate = nullptr;
-          const Device<float> bias(gate.bias);
-          const Device<std::uint16_t> gate_weight(bf16_rows(gate.weight, c.depth, stride));
-          const Device<std::uint16_t> x(bf16_rows(of.x, c.depth, stride)),
-              weight(bf16_rows(of.weight, c.depth, stride));
-          LinearBf16Job job = {x.get(),    weight.get(), stride,    stride, c.n_row,
-                               c.n_column, c.depth,      c.n_split, shares, end};
-          if (tile.is_gated) job.gate_weight = gate_weight.get(), job.gate_bias = c.has_bias ? bias.get() : nullptr;
+        return product.run([&](LinearBf16Job& job) {
+          job.partial = shares;
           launch(hopper_linear_bf16(tile, job), job);
           if (shares != nullptr) launch(finish_bf16_partial(job), job);
         });
       };
-      const double most = c.is_bf16 ? 4e-3 : (tile.is_gated ? 2 : 1) * (1e-6 + bf16_sum_error(c.depth));
       std::vector<float> by_kernel;  // y whose shares another kernel adds
       if (c.n_split > 1) {
         const Device<float> partial(static_cast<std::size_t>(2 * c.n_split * c.n_row * c.n_column));
         schedule = {7, false};
         by_kernel = run(partial.get());
-        CHECK(error(by_kernel, expected) < most);
+        CHECK(error(by_kernel, expected) < product.most());
       }
       // Activations that round once are the same in every kernel.
       const bool is_exact = c.activation == Activation::none || c.activation == Activation::relu;
       in_two_schedules(static_cast<std::size_t>((&c - kHopperCases) + (&tile - kHopperTiles)), [&] {
         const std::vector<float> y = run(nullptr);
-        CHECK(error(y, expected) < most);
+        CHECK(error(y, expected) < product.most());
         if (c.n_split > 1 && is_exact) CHECK(y == by_kernel);
       });
     }

@@ -4,7 +4,7 @@
 
 #include <algorithm>
 
-#include "cuda/products.h"
+#include "cuda/gated_product.h"
 
 namespace hopper_tma_test {
 
@@ -49,36 +49,14 @@ TEST_CASE("products whose operands TMA fetches are as near to doubles, and those
   }
   counts = {};
   for (const ProductCase& c : kCases) {
-    const std::int64_t stride = round_up(c.depth, 8) + 8;
     for (const HopperTmaTile& tile : kHopperTmaTiles) {
       INFO(tile.kernel, ", ", c.n_row, " x ", c.depth, " x ", c.n_column);
-      Operands of(c, true);
-      // What the gate's product is, is the gate of what is expected.
-      Operands gate({c.n_row, c.depth, c.n_column, 1, Activation::none, c.has_bias}, true);
-      if (tile.is_gated) {
-        std::reverse_copy(of.weight.begin(), of.weight.end(), gate.weight.begin());
-        const std::vector<double> made = gate.expected();
-        std::copy(made.begin(), made.end(), of.gate.begin()), of.c.has_gate = true;
-      }
-      const auto run = [&](auto launch_one) {
-        return run_product(of, [&](Epilogue end) {
-          if (tile.is_gated) end.gate = nullptr;
-          const Device<float> bias(gate.bias);
-          const Device<std::uint16_t> gate_weight(bf16_rows(gate.weight, c.depth, stride));
-          const Device<std::uint16_t> x(bf16_rows(of.x, c.depth, stride)),
-              weight(bf16_rows(of.weight, c.depth, stride));
-          LinearBf16Job job = {.x = x.get(), .weight = weight.get(), .x_stride = stride, .weight_stride = stride};
-          job.n_row = c.n_row, job.n_column = c.n_column, job.depth = c.depth, job.n_split = 1, job.end = end;
-          if (tile.is_gated) job.gate_weight = gate_weight.get(), job.gate_bias = c.has_bias ? bias.get() : nullptr;
-          launch_one(job);
-        });
-      };
+      const GatedProduct product(c, tile.is_gated);
       const std::vector<float> other =
-          run([&](const LinearBf16Job& job) { launch(hopper_linear_bf16(tile_of(tile), job), job); });
-      const double most = c.is_bf16 ? 4e-3 : (tile.is_gated ? 2 : 1) * (1e-6 + bf16_sum_error(c.depth));
+          product.run([&](const LinearBf16Job& job) { launch(hopper_linear_bf16(tile_of(tile), job), job); });
       in_two_schedules(static_cast<std::size_t>((&c - kCases) + (&tile - kHopperTmaTiles)), [&] {
-        const std::vector<float> y = run([&](const LinearBf16Job& job) { launch_tma(tile, job); });
-        CHECK(error(y, of.expected()) < most);
+        const std::vector<float> y = product.run([&](const LinearBf16Job& job) { launch_tma(tile, job); });
+        CHECK(error(y, product.expected()) < product.most());
         CHECK(y == other);
       });
     }
