@@ -60,10 +60,11 @@ class GpuTableTest(unittest.TestCase):
         self.assertEqual(set(measured.values()), {"not measured"})
         self.assertEqual(row["predicted"], "12.40")
 
-    def test_acts_without_a_way_stand_beside_those_with_all(self):
-        families = {"smolvla": {"stored": {"ms": {"network": 7.0}}, "without": {"clusters": {"ms": {"network": 7.5}}, "adders": None}}}
+    def test_acts_in_another_way_stand_beside_those_as_estimated(self):
+        ways = {"without clusters": {"ms": {"network": 7.5}}, "with tma": None}
+        families = {"smolvla": {"stored": {"ms": {"network": 7.0}}, "ways": ways}}
         row = cells("\n".join(gpu_table.ways({"families": families})).strip(), "`smolvla`")
-        self.assertEqual((row["with all ways"], row["without clusters"], row["without adders"]), ("7.00", "7.50", "not measured"))
+        self.assertEqual((row["as estimated"], row["without clusters"], row["with tma"]), ("7.00", "7.50", "not measured"))
 
     def test_failed_checks_and_cuBLAS_are_told(self):
         text = gpu_table.block([VISIT])

@@ -32,6 +32,13 @@ constexpr HopperTmaTile kHopperTmaTiles[] = {
 #undef VLA_HOPPER_TMA_TILE
 };
 
+/// The tile of the same shape whose operands TMA fetches, or null.
+inline const HopperTmaTile* tma_tile_of(const HopperTile& tile) {
+  for (const HopperTmaTile& one : kHopperTmaTiles)
+    if (one.columns == tile.columns && one.rows == tile.rows && one.is_gated == tile.is_gated) return &one;
+  return nullptr;
+}
+
 constexpr int kTmaCluster = 2;  // blocks
 /// Bytes of a stage's two mbarriers, and the number of stages that shared memory holds with them.
 constexpr int kTmaBarriers = 16;

@@ -3,7 +3,6 @@
 #include "lower/cuda/cuda_device.h"
 
 #include <algorithm>
-#include <cstdlib>
 #include <limits>
 
 #include "lower/cuda/cuda_program.h"
@@ -27,14 +26,14 @@ Multiplier multiplier_of(const CudaWeight& weight) {
 
 Result<std::unique_ptr<Device>> CudaDevice::open(const cuda::Driver& driver, int index,
                                                  const std::vector<std::string>& modules, Rounding at_load) {
-  VLA_TRY(const CudaWays ways, cuda_ways(std::getenv("VLA_CUDA_WITHOUT")));
+  VLA_TRY(const CudaWays ways, cuda_ways_of_environment());
   VLA_TRY(std::shared_ptr<CudaQueue> queue, CudaQueue::open(driver, index, modules));
   const std::string name = "cuda:" + std::to_string(index) + ", " + queue->gpu()->name();
   return std::unique_ptr<Device>(new CudaDevice(name, std::move(queue), ways, at_load));
 }
 
 Result<std::unique_ptr<Device>> CudaDevice::model(const std::string& name, Rounding at_load) {
-  VLA_TRY(const CudaWays ways, cuda_ways(std::getenv("VLA_CUDA_WITHOUT")));
+  VLA_TRY(const CudaWays ways, cuda_ways_of_environment());
   VLA_TRY(const GpuModel found, find_gpu_model(name));
   std::unique_ptr<CudaDevice> device(new CudaDevice(std::string("model of ") + found.description,
                                                     std::make_shared<CudaQueue>(found.n_sm, found.is_hopper), ways,

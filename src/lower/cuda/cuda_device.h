@@ -13,8 +13,8 @@ namespace vla::lower {
 /// A GPU that runs our own kernels (cuda/kernels). An act is one captured graph.
 class CudaDevice final : public Device {
  public:
-  /// modules: the kernels' PTX. at_load: see CudaWeights::load. `VLA_CUDA_WITHOUT` names ways that are not used (see
-  /// cuda_ways). Errors: device, usage.
+  /// modules: the kernels' PTX. at_load: see CudaWeights::load. The environment may name other ways
+  /// to lower graphs (cuda_ways.h). Errors: device, usage.
   static Result<std::unique_ptr<Device>> open(const cuda::Driver& driver, int index,
                                               const std::vector<std::string>& modules, Rounding at_load);
   /// Models a GPU that is not present (DeviceLibrary::model). Errors: usage for an unknown name.

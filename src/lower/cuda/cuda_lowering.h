@@ -33,6 +33,7 @@ struct ProductCut {
   std::optional<std::size_t> tile = {};          // of Hopper: index into kHopperTiles or kHopperInt8Tiles
   bool in_cluster = false;                       // of Hopper: a cluster's blocks add the shares
   double us = 0;                                 // estimated time on Hopper
+  bool by_tma = false;                           // of Hopper: TMA fetches the tile's operands (hopper_tma.h)
 };
 /// How attention is cut into blocks of query rows and shares of the keys.
 struct AttentionPlan {
@@ -77,10 +78,16 @@ inline bool leaves_shares(const CudaOp& op) { return op.partial != kNone && op.w
 
 struct CudaLowering : Lowering {
   CudaLowering(Lowering of, const CudaWeights& loaded, const CudaQueue& queue, const CudaWays& used)
-      : Lowering(std::move(of)), weights(loaded), n_sm(queue.n_sm()), is_hopper(queue.is_hopper()), ways(used) {}
+      : Lowering(std::move(of)),
+        weights(loaded),
+        gpu(queue.gpu().get()),
+        n_sm(queue.n_sm()),
+        is_hopper(queue.is_hopper()),
+        ways(used) {}
 
   const CudaWeights& weights;
-  int n_sm;  // SMs of the device
+  const cuda::Gpu* gpu;  // null for a model of one
+  int n_sm;              // SMs of the device
   bool is_hopper;
   CudaWays ways;
   std::vector<CudaOp> ops = {};

@@ -162,7 +162,7 @@ class Costs {
       const Param& weight = *node->as<op::Linear>()->weight;
       const MatrixKind kind = l.matrix(*node).kind;
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
-      const auto [shape, n_split, tile, in_cluster, us] = op.cut;
+      const auto [shape, n_split, tile, in_cluster, us, by_tma] = op.cut;
       const std::int64_t size = shape == cuda::Bf16Shape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>(ceil_div(columns, size) * ceil_div(rows, size));
       if (kind == MatrixKind::f32) {  // padded rows and columns are multiplied, too

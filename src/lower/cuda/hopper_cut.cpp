@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <limits>
 
-#include "cuda/kernels/linear_bf16.h"
+#include "cuda/kernels/hopper_tma.h"
 #include "cuda/kernels/linear_int8.h"
 #include "lower/cuda/cluster_cost.h"
 #include "lower/cuda/cuda_lowering.h"
@@ -57,6 +57,7 @@ constexpr double kWritten = 2.5e6;  // bytes that all SMs together write to memo
 struct Candidate {
   std::size_t index;
   std::int64_t columns, rows, step_bytes;
+  bool by_tma = false;
 };
 
 std::vector<Candidate> candidates(MatrixKind kind, HopperCutFor what) {
@@ -69,6 +70,8 @@ std::vector<Candidate> candidates(MatrixKind kind, HopperCutFor what) {
           (what == HopperCutFor::begins_norm && begins == nullptr))
         continue;
       all.push_back({i, columns, rows, (columns + rows) * 128});
+      if (cuda::tma_tile_of(cuda::kHopperTiles[i]) != nullptr)
+        all.push_back({i, columns, rows, (columns + rows / cuda::kTmaCluster) * 128, true});
     }
   const bool is_ternary = kind == MatrixKind::ternary;
   if (is_ternary || kind == MatrixKind::int8)
@@ -98,6 +101,8 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
       const bool has_adder = n_split > 1 && !in_cluster;
       if (has_adder && (what == HopperCutFor::begins_norm || (!ways.adders && n_row <= 64))) continue;
       if (in_cluster && !ways.clusters) continue;
+      const bool is_for_tma = n_split == 1 && n_row > 64 && what != HopperCutFor::several;
+      if (tile.by_tma && !(ways.tma && is_for_tma)) continue;
       const auto size = static_cast<double>(tile.columns * tile.rows);
       const std::int64_t n_of_y = what == HopperCutFor::gated ? tile.columns / 2 : tile.columns;
       const auto n_used = static_cast<double>(std::min(tile.rows, n_row));
@@ -114,7 +119,9 @@ ProductCut cut_for_hopper(MatrixKind kind, std::int64_t n_row, std::int64_t n_co
       const auto n_wave = static_cast<double>(ceil_div(n_whole * n_split, n_usable));
       double us = rates.kernel + of_block * (1 + rates.further * (n_wave - 1));
       if (has_adder) us += static_cast<double>(4 * n_row * n_column * (n_split + 1)) / kWritten;
-      if (us < best.us) best.n_split = n_split, best.tile = tile.index, best.in_cluster = in_cluster, best.us = us;
+      if (us < best.us)
+        best.n_split = n_split, best.tile = tile.index, best.in_cluster = in_cluster, best.us = us,
+        best.by_tma = tile.by_tma;
     }
   return best;
 }

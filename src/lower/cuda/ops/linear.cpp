@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "cuda/kernels/linear_bf16.h"
+#include "cuda/kernels/hopper_tma.h"
 #include "cuda/kernels/linear_f32.h"
 #include "cuda/kernels/linear_int8.h"
 #include "kernels/quantized.h"
@@ -27,12 +27,25 @@ cuda::NormBegin norm_begin(const CudaLowering& l, const HalvedNorm& norm) {
           .moments = moments(l, norm)};
 }
 
-/// gate: the gate product, if the same kernel computes it with this one; else null.
-void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const CudaWeight& matrix, const Param& weight,
-                 const cuda::Epilogue& end, const op::Linear* gate, Calls& calls) {
+/// Adds a product whose operands TMA fetches. Errors: device.
+Status add_tma_product(const CudaLowering& l, const cuda::HopperTmaTile& tile, const cuda::LinearBf16Job& product,
+                       Calls& calls) {
+  cuda::HopperTmaJob job = {.x = {}, .weight = {}, .gate_weight = {}, .product = product};
+  if (l.gpu != nullptr) {
+    VLA_CHECK(l.gpu->map_rows(mapped_x(tile, product), job.x));
+    VLA_CHECK(l.gpu->map_rows(mapped_weight(tile, product, product.weight), job.weight));
+    if (tile.is_gated) VLA_CHECK(l.gpu->map_rows(mapped_weight(tile, product, product.gate_weight), job.gate_weight));
+  }
+  calls.push_back(call(cuda::hopper_tma_bf16(tile, product), job));
+  return {};
+}
+
+/// gate: the gate product, if the same kernel computes it with this one; else null. Errors: device.
+Status add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const CudaWeight& matrix, const Param& weight,
+                   const cuda::Epilogue& end, const op::Linear* gate, Calls& calls) {
   const Value& x = l.value(of);
   const int rows = narrow(rows_of(x.shape)), columns = narrow(weight.shape[1]), depth = narrow(x.shape[0]);
-  const auto [shape, n_split, tile, in_cluster, us] = op.cut;
+  const auto [shape, n_split, tile, in_cluster, us, by_tma] = op.cut;
   switch (matrix.kind) {
     case MatrixKind::f32: {
       const cuda::LinearF32Job job = {.x = l.at(of),
@@ -43,7 +56,7 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                       .depth = depth,
                                       .end = end};
       calls.push_back(call(cuda::linear_f32(job), job));
-      return;
+      return {};
     }
     case MatrixKind::bf16: {
       const cuda::LinearBf16Job job = {
@@ -62,10 +75,11 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
           .rotation = {l.at(op.rotation.table), narrow(op.rotation.d_head), narrow(op.rotation.n_token)},
           .norm_begin = norm_begin(l, op.begins),
           .norm_end = {moments(l, op.ends), op.ends.eps, op.ends.bias != kNone}};
+      if (by_tma) return add_tma_product(l, *cuda::tma_tile_of(cuda::kHopperTiles[*tile]), job, calls);
       calls.push_back(
           call(tile ? cuda::hopper_linear_bf16(cuda::kHopperTiles[*tile], job) : cuda::linear_bf16(shape, job), job));
       if (op.partial != kNone && !leaves_shares(op)) calls.push_back(call(cuda::finish_bf16_partial(job), job));
-      return;
+      return {};
     }
     case MatrixKind::ternary:
     case MatrixKind::int4:
@@ -84,9 +98,10 @@ void add_product(const CudaLowering& l, const CudaOp& op, ValueId of, const Cuda
                                 : cuda::linear_int8(code_kind(matrix.kind), int8_shape(shape), job),
                            job));
       if (op.partial != kNone) calls.push_back(call(cuda::finish_int8_partial(job), job));
-      return;
+      return {};
     }
   }
+  return {};
 }
 
 }  // namespace
@@ -112,7 +127,7 @@ Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const LinearOp& 
       end.factor = l.at(linear.factor), end.residual = l.at(linear.residual);
     }
     const op::Linear* gate = is_one ? linear.linears[0]->as<op::Linear>() : nullptr;
-    add_product(l, op, linear.x, matrix, *product.weight, end, gate, calls);
+    VLA_CHECK(add_product(l, op, linear.x, matrix, *product.weight, end, gate, calls));
   }
   return calls;
 }
