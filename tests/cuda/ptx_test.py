@@ -41,6 +41,7 @@ STRIP_LOOPS = {
         *([f"linear_strip_{width}_begins"] if width < 128 else []),
     )
 }
+HOPPER_PRODUCTS = ("hopper_linear", "hopper_tma")
 # Of a tile for Hopper a warpgroup multiplies 128 bytes of the depth.
 HOPPER_LOOP = {"bf16": "HGMMA.64x{}x16.F32.BF16", "int8": "IGMMA.64x{}x32.S8.S8", "ternary": "IGMMA.64x{}x32.S8.S8"}
 TWO_BLOCKS = {name for name in MAIN_LOOPS if name.startswith("linear")} | {"attention_bf16_64"}
@@ -88,7 +89,7 @@ def test_no_kernel_of_any_architecture_spills(machine_code):
 def test_tiles_for_hopper_fit_it_and_their_products_do_not_wait_for_each_other(machine_code):
     if not cuda_kernels.tool("nvdisasm"):
         pytest.skip("no nvdisasm: it is beside the nvcc that `make test` downloads")
-    kernels = {name: code for (_, name), code in machine_code.items() if name.startswith("hopper_linear")}
+    kernels = {name: code for (_, name), code in machine_code.items() if name.startswith(HOPPER_PRODUCTS)}
     assert len(kernels) > 40
     for name, (used, loop) in kernels.items():
         way, kind, columns, rows = re.match(r"hopper_(linears?|tma)_([a-z0-9]+)_(\d+)x(\d+)", name).groups()
@@ -110,7 +111,7 @@ def test_main_loops_have_the_tensor_instructions_that_they_need(machine_code):
         pytest.skip("no nvdisasm: it is beside the nvcc that `make test` downloads")
     for (sm, name), (_, loop) in machine_code.items():
         tensor = {op: n for op, n in loop.items() if op.startswith(cuda_kernels.TENSOR)}
-        if not name.startswith("hopper_linear"):
+        if not name.startswith(HOPPER_PRODUCTS):
             expected = MAIN_LOOPS.get(name.removeprefix("hopper_")) or STRIP_LOOPS.get(name)
             assert tensor == (dict([expected]) if expected else {}), (sm, name)
 

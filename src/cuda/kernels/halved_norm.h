@@ -46,17 +46,15 @@ struct NormedColumns {
   /// sums_of(row, kCount numbers): the sums of a row of x.
   template <class SumsOf>
   VLA_DEVICE void load(const LinearBf16Job& job, SumsOf sums_of) {
-    const bool has_mean = job.norm_end.moments.sums != nullptr;
-    if (has_mean) add_rows(job.n_row, sums_of, weight);
-    if (job.norm_end.has_bias) add_rows(job.n_row + (has_mean ? 2 : 0), sums_of, bias);
-  }
-  /// The sums of two rows, of which the second has what the first one's rounding took.
-  template <class SumsOf>
-  static VLA_DEVICE void add_rows(int row, SumsOf sums_of, float (&to)[kCount]) {
-    float rest[kCount];
-    sums_of(row, to), sums_of(row + 1, rest);
+    const int n_of_weight = job.norm_end.moments.sums != nullptr ? 2 : 0;
+#pragma unroll 1
+    for (int i = 0; i < job.norm_end.n_more(); ++i) {  // a row at a time, which takes few registers
+      float row[kCount];
+      sums_of(job.n_row + i, row);
 #pragma unroll
-    for (int c = 0; c < kCount; ++c) to[c] += rest[c];
+      for (int c = 0; c < kCount; ++c)
+        weight[c] += i < n_of_weight ? row[c] : 0, bias[c] += i < n_of_weight ? 0 : row[c];
+    }
   }
   /// The norm's product, from a sum of column c.
   VLA_DEVICE float normed(const RowTerms& row, float sum, int c) const {
