@@ -169,8 +169,7 @@ VLA_KERNEL(linear_bf16_few, 128, 4, LinearBf16Job) { multiply_few(job); }
 namespace {
 
 /// Adds four adjacent sums over all shares of the depth, in order, from column `at` of a row of sums on; the first n
-/// exist. kTogether: all four exist and are aligned, and there are at most
-/// kMostSplits shares, loaded at once.
+/// exist. kTogether: all four exist and are aligned, and there are at most kMostSplits shares, loaded at once.
 template <bool kTogether>
 VLA_DEVICE Four add_row(const LinearBf16Job& job, int row, int at, int n) {
   const std::int64_t apart = static_cast<std::int64_t>(job.n_row_x()) * job.n_sum();

@@ -21,6 +21,10 @@ struct Rotation {
   }
 };
 
+/// Rows that follow those of y where a norm is halved: of a layer norm's weight, and of a bias, two each (NormBegin).
+VLA_HOST_DEVICE constexpr int rows_of_norm(bool is_layer, bool has_bias) {
+  return (is_layer ? 2 : 0) + (has_bias ? 2 : 0);
+}
 /// What a product that begins a norm leaves of its rows: sums over parts of `part` columns each, the last part may have
 /// fewer.
 struct RowMoments {
@@ -45,7 +49,7 @@ struct NormEnd {
   bool has_bias = false;
 
   /// Rows of x after the last of y. With such rows, a block must have all rows.
-  VLA_HOST_DEVICE int n_more() const { return (moments.sums != nullptr ? 2 : 0) + (has_bias ? 2 : 0); }
+  VLA_HOST_DEVICE int n_more() const { return rows_of_norm(moments.sums != nullptr, has_bias); }
 };
 
 struct LinearBf16Job {
@@ -69,7 +73,7 @@ struct LinearBf16Job {
   /// Only for undivided strips of up to 64 columns without halves, and Hopper's tiles that have a kernel for it, if
   /// they compute y: without activation, gate and final ReLU.
   NormBegin norm_begin = {};
-  /// Only for strips and Hopper's tiles; with n_more() == 0 also where finish_bf16_partial adds the shares.
+  /// Only for strips and Hopper's tiles, and with n_more() == 0 for any product whose shares finish_bf16_partial adds.
   NormEnd norm_end = {};
 
   VLA_HOST_DEVICE int n_sum() const { return gate_weight ? 2 * n_column : n_column; }  // per row

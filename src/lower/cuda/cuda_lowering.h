@@ -59,7 +59,7 @@ struct HalvedNorm {
 
   /// The values that the norm's products read beside `rows`.
   std::vector<ValueId> moments() const { return sums == kNone ? std::vector{squares} : std::vector{squares, sums}; }
-  int n_more() const { return (sums != kNone ? 2 : 0) + (bias != kNone ? 2 : 0); }  // cuda::NormEnd::n_more()
+  int n_more() const { return cuda::rows_of_norm(sums != kNone, bias != kNone); }
 };
 
 struct CudaOp : Step {
@@ -117,6 +117,8 @@ void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 /// Lets products of a solver step begin and end norms where that is faster than an operation for the norm, and removes
 /// those operations. Part of choose_layouts, before shares have values.
 void halve_norms(CudaLowering& l);
+/// Whether all matrices of a product are bf16.
+bool is_of_bf16(const CudaLowering& l, const LinearOp& product);
 /// The operation whose first result is this value, or null.
 CudaOp* maker_of(CudaLowering& l, ValueId id);
 

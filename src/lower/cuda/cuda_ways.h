@@ -13,7 +13,7 @@ namespace vla::lower {
 struct CudaWays {
   bool clusters = true;      // blocks of a cluster add the shares of a product, or combine those of attention
   bool adders = true;        // kernels of their own add the shares of products of up to 64 rows
-  bool halved_norms = true;  // products begin and end RMS norms
+  bool halved_norms = true;  // products begin and end norms
   bool rotations = true;     // products rotate heads
   bool tma = false;          // TMA fetches the operands of products of more than 64 rows, where its tiles fit
 };

@@ -8,21 +8,17 @@
 namespace vla::lower {
 namespace {
 
-bool is_bf16(const CudaLowering& l, const LinearOp& product) {
-  return std::ranges::all_of(product.linears,
-                             [&](const Node* node) { return l.matrix(*node).kind == MatrixKind::bf16; });
-}
 /// Whether kernels of a product can begin a norm of its result (cuda::LinearBf16Job::norm_begin).
 bool can_begin(const CudaLowering& l, const CudaOp& op) {
   const auto* product = std::get_if<LinearOp>(&op.op);
-  return product != nullptr && product->linears.size() == 1 && is_bf16(l, *product) &&
+  return product != nullptr && product->linears.size() == 1 && is_of_bf16(l, *product) &&
          op.cut.shape != cuda::Bf16Shape::few && op.rotation.table == kNone && op.begins.squares == kNone &&
          l.value(op.writes[0]).type == DType::f32 && product->activation == Activation::none && !product->ends_in_relu;
 }
 /// Whether kernels of a product can end the norm of its x, which is `rows` (cuda::LinearBf16Job::norm_end).
 bool can_end(const CudaLowering& l, const CudaOp& op, ValueId rows, int n_more) {
   const auto* product = std::get_if<LinearOp>(&op.op);
-  if (product == nullptr || product->x != rows || !is_bf16(l, *product)) return false;
+  if (product == nullptr || product->x != rows || !is_of_bf16(l, *product)) return false;
   const bool has_own = op.cut.tile || strip_width(op.cut.shape) > 0;  // kernels that take more rows of x than of y
   if (n_more == 0) return has_own || op.cut.n_split > 1;
   const std::int64_t most = op.cut.tile ? cuda::kHopperTiles[*op.cut.tile].rows : 64;
@@ -49,7 +45,7 @@ CudaOp* beginner_of(CudaLowering& l, const CudaOp& norm, const RoundOp& what) {
   if (maker == nullptr || !can_begin(l, *maker) || !is_before(l, what.weight, *maker) ||
       !is_before(l, what.bias, *maker))
     return nullptr;
-  const int n_more = (is_layer(what) ? 2 : 0) + (what.bias != kNone ? 2 : 0);
+  const int n_more = cuda::rows_of_norm(is_layer(what), what.bias != kNone);
   const auto needs_norm = [&](const CudaOp& op) { return reads(l, op, rows) && !can_end(l, op, rows, n_more); };
   return std::ranges::any_of(l.ops, needs_norm) ? nullptr : maker;
 }
@@ -94,6 +90,11 @@ void halve_norm(CudaLowering& l, CudaOp& norm, const RoundOp& what) {
 }
 
 }  // namespace
+
+bool is_of_bf16(const CudaLowering& l, const LinearOp& product) {
+  return std::ranges::all_of(product.linears,
+                             [&](const Node* node) { return l.matrix(*node).kind == MatrixKind::bf16; });
+}
 
 CudaOp* maker_of(CudaLowering& l, ValueId id) {
   const auto makes = [&](const CudaOp& op) { return !op.writes.empty() && op.writes[0] == id; };

@@ -124,8 +124,7 @@ class CudaLayouts final : Layouts<CudaLowering> {
   /// Whether one block computes columns of both gate and up.
   bool multiplies_both(const LinearOp& op, std::int64_t n_row) const {
     const bool has_kernel = is_of_strips(n_row, l.value(op.x).shape[0]) || (l.is_hopper && n_row > 64);
-    const auto is_bf16 = [&](const Node* node) { return l.matrix(*node).kind == MatrixKind::bf16; };
-    return has_kernel && std::ranges::all_of(op.linears, is_bf16);
+    return has_kernel && is_of_bf16(l, op);
   }
   /// Adds the value for partial results if there are several shares. n: floats per share.
   void split(CudaOp& op, int n_split, std::int64_t n) {
