@@ -4,12 +4,21 @@
 also shows those in assembly, and runs in the place of the right one."""
 
 import os
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
 import cuda_kernels
 from conftest import run_tests
 from mistakes import MISTAKES, TESTS
+
+# Of Hopper's many tiles a mistake is made in these alone, since all of them take nvcc half a minute.
+TILES = {"64, 64", "64, 128", "128, 48", "128, 64", "128, 96", "192, 112"}
+
+
+def with_few_tiles(header):
+    """The text of a header whose lists of tiles name TILES alone."""
+    return re.sub(r"each\((\d+, \d+)\)", lambda tile: tile[0] if tile[1] in TILES else "", header)
 
 
 def outcome(name, ptx, folder):
@@ -22,10 +31,11 @@ def outcome(name, ptx, folder):
     text = place.read_text()
     assert text.count(old) >= 1, f"{name}: {file} has no {old!r}"
     place.write_text(text.replace(old, new))
+    for header in (sources / "cuda/kernels").glob("linear_*.h"):
+        header.write_text(with_few_tiles(header.read_text()))
     source = sources / f"cuda/kernels/{kernel}.cu"
     module = cuda_kernels.compile_ptx(source, folder, cuda_kernels.targets(source)[-1], sources, warnings=())
-    others = [one for one in ptx if one.name != module.name]
-    code, output = run_tests([module, *others], f"--source-file={TESTS[kernel]}", "--abort-after=1")
+    code, output = run_tests([module, *ptx], f"--source-file={TESTS[kernel]}", "--abort-after=1")
     shutil.rmtree(folder)
     return output if code else ""
 
