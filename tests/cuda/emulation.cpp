@@ -32,16 +32,20 @@ struct Thread {
   int number = 0;
   Block* block = nullptr;
 };
-/// Sums of wgmma, and where each lane has them.
-struct Sums : WgmmaSums {
+/// Registers of wgmma, and where each lane has them.
+struct Sums : WgmmaRegisters {
   std::uint32_t* lanes[kWarp];
+};
+struct OperandA : WgmmaRegisters {
+  const std::uint32_t* lanes[kWarp];
 };
 struct Warp {
   Meeting* lanes[kWarp] = {};
   int n_here = 0;
   Meeting::Kind kind = Meeting::kSync;  // what the lanes that are here came to
   Wgmma wgmma = {};
-  std::list<Sums> sums = {};  // in flight
+  std::list<Sums> sums = {};           // in flight
+  std::list<OperandA> operands = {};  // likewise
 };
 /// A block of the cluster that runs.
 struct Block {
@@ -277,11 +281,11 @@ void wait_mbarrier(std::byte* mbarrier, unsigned parity) {
     go_on(cluster.self->fiber);
   }
 }
-void copy_box(std::byte* to, const void* map, int column, int row, std::byte* mbarrier, unsigned blocks) {
+void copy_box(std::byte* to, const void* map, std::span<const int> place, std::byte* mbarrier, unsigned blocks) {
   SharedMemory& shared = own_block().shared;
   const std::size_t at = shared.offset(to);
   const std::vector<std::byte> box = copy_box(
-      map, column, row, at, [](std::uintptr_t from, std::size_t) { return reinterpret_cast<const std::byte*>(from); });
+      map, place, at, [](std::uintptr_t from, std::size_t) { return reinterpret_cast<const std::byte*>(from); });
   const auto copy = [&](SharedMemory& block) {
     block.bulk_copy(at, box, shared.offset(mbarrier), shared, cluster.self->number);
   };
@@ -304,7 +308,23 @@ Sums& sums_of(Warp& warp, Meeting* const* lanes) {
   }
   return made;
 }
+/// Keeps what is in the lanes' registers of operand a, if it is there.
+OperandA* operand_of(Warp& warp, Meeting* const* lanes) {
+  if (!lanes[0]->product->a_in_registers) return nullptr;
+  OperandA& made = warp.operands.emplace_back();
+  made.of.resize(4);
+  for (std::size_t l = 0; l < kWarp; ++l) {
+    made.lanes[l] = lanes[l]->a;
+    for (std::size_t i = 0; i < made.of.size(); ++i) made.of[i][l] = lanes[l]->a[i];
+  }
+  return &made;
+}
 void give_back(Warp& warp) {
+  for (const OperandA& a : warp.operands)
+    for (std::size_t l = 0; l < kWarp && a.n_product == 0; ++l)
+      for (std::size_t i = 0; i < a.of.size(); ++i)
+        if (a.lanes[l][i] != a.of[i][l]) fault("writes registers of wgmma that it has not waited for");
+  std::erase_if(warp.operands, [](const OperandA& a) { return a.n_product == 0; });
   for (const Sums& sums : warp.sums)
     for (std::size_t l = 0; l < kWarp && sums.n_product == 0; ++l)
       for (std::size_t i = 0; i < sums.of.size(); ++i) sums.lanes[l][i] = sums.of[i][l];
@@ -354,7 +374,7 @@ void compute(Meeting* const* lanes, int warp) {
     case Meeting::kWgmma:
       for (int l = 1; l < kWarp; ++l)
         if (*lanes[l]->product != *lanes[0]->product) fault("lanes of a warp issue different products");
-      return of.wgmma.issue(*lanes[0]->product, sums_of(of, lanes));
+      return of.wgmma.issue(*lanes[0]->product, sums_of(of, lanes), operand_of(of, lanes));
     case Meeting::kWgmmaFence:
       return of.wgmma.fence();
     case Meeting::kWgmmaCommit:

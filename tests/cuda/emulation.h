@@ -7,11 +7,13 @@
 /// other. What a warp does as one is computed by the lane that comes last.
 #define VLA_EMULATED_DEVICE 1
 
+#include <array>
 #include <bit>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <span>
 
 #define __shared__
 #define VLA_DEVICE inline
@@ -85,15 +87,15 @@ void fence_mbarriers();
 void arrive(std::byte* mbarrier, int n_byte);
 void arrive_at_block(std::byte* mbarrier, int rank);
 void wait_mbarrier(std::byte* mbarrier, unsigned parity);
-/// Copies a box of a tensor map to those blocks of the cluster whose bits are set; 0: this one.
-void copy_box(std::byte* to, const void* map, int column, int row, std::byte* mbarrier, unsigned blocks);
+/// Copies a box of a tensor map, from a place on, to those blocks of the cluster whose bits are set; 0: this one.
+void copy_box(std::byte* to, const void* map, std::span<const int> place, std::byte* mbarrier, unsigned blocks);
 
-/// A product of a warpgroup: sums[64][n] (+)= a[64][depth] * b[n][depth].
+/// A product of a warpgroup: sums[64][n] (+)= a[64][depth] * b[n][depth], or b[depth][n] if it is transposed.
 struct WgmmaProduct {
   enum Kind { bf16, s8 } kind = bf16;
   int n = 0;
-  std::uint64_t a = 0, b = 0;  // matrix descriptors
-  bool adds = false;
+  std::uint64_t a = 0, b = 0;  // matrix descriptors; a is none if it is in registers
+  bool adds = false, a_in_registers = false, b_transposed = false;
 
   int depth() const { return kind == bf16 ? 16 : 32; }
   friend bool operator==(const WgmmaProduct&, const WgmmaProduct&) = default;
@@ -149,11 +151,15 @@ inline void arrive(std::byte* mbarrier) { test::cuda::arrive(mbarrier, 0); }
 inline void arrive_expecting(std::byte* mbarrier, int n_byte) { test::cuda::arrive(mbarrier, n_byte); }
 template <class Map>
 void copy_box(std::byte* to, const Map& map, int column, int row, std::byte* mbarrier) {
-  test::cuda::copy_box(to, &map, column, row, mbarrier, 0);
+  test::cuda::copy_box(to, &map, std::array{column, row}, mbarrier, 0);
+}
+template <class Map>
+void copy_box_of_head(std::byte* to, const Map& map, int column, int head, int token, int batch, std::byte* mbarrier) {
+  test::cuda::copy_box(to, &map, std::array{column, head, token, batch}, mbarrier, 0);
 }
 template <class Map>
 void copy_box_to_blocks(std::byte* to, const Map& map, int column, int row, std::byte* mbarrier, unsigned blocks) {
-  test::cuda::copy_box(to, &map, column, row, mbarrier, blocks);
+  test::cuda::copy_box(to, &map, std::array{column, row}, mbarrier, blocks);
 }
 inline void meet_cluster() { test::cuda::cluster_barrier(true); }
 inline void leave_cluster() { test::cuda::cluster_barrier(false); }
@@ -184,19 +190,22 @@ inline void multiply_bf16(float (&sum)[4], const unsigned (&a)[4], unsigned b0, 
   std::memcpy(sum, bits, sizeof(bits));
 }
 template <class T>
-void wgmma(test::cuda::WgmmaProduct::Kind kind, int n, T* sum, std::uint64_t a, std::uint64_t b, bool adds) {
-  const test::cuda::WgmmaProduct product = {kind, n, a, b, adds};
-  test::cuda::Meeting mine = {test::cuda::Meeting::kWgmma};
+void wgmma(const test::cuda::WgmmaProduct& product, T* sum, const unsigned* a = nullptr) {
+  test::cuda::Meeting mine = {test::cuda::Meeting::kWgmma, a};
   mine.to = reinterpret_cast<std::uint32_t*>(sum), mine.product = &product;
   test::cuda::meet(mine);
 }
 template <int kN>
 void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
-  wgmma(test::cuda::WgmmaProduct::bf16, kN, sum, a, b, adds);
+  wgmma({test::cuda::WgmmaProduct::bf16, kN, a, b, adds}, sum);
+}
+template <int kN>
+void wgmma_bf16(float (&sum)[kN / 2], const unsigned (&a)[4], std::uint64_t b) {
+  wgmma({test::cuda::WgmmaProduct::bf16, kN, 0, b, true, true, true}, sum, a);
 }
 template <int kN>
 void wgmma_s8(int (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
-  wgmma(test::cuda::WgmmaProduct::s8, kN, sum, a, b, adds);
+  wgmma({test::cuda::WgmmaProduct::s8, kN, a, b, adds}, sum);
 }
 inline void wgmma_fence() {
   test::cuda::Meeting mine = {test::cuda::Meeting::kWgmmaFence};
@@ -211,6 +220,12 @@ void wgmma_wait() {
   test::cuda::Meeting mine = {test::cuda::Meeting::kWgmmaWait};
   mine.n_left = kLeft;
   test::cuda::meet(mine);
+}
+template <class T, int kCount>
+void pin(T (&)[kCount]) {}
+template <int kLeft, class T, int kCount>
+void wgmma_wait_for(T (&)[kCount]) {
+  wgmma_wait<kLeft>();
 }
 template <class T, int kCount>
 void wgmma_wait_all(T (&)[kCount]) {

@@ -420,21 +420,25 @@ struct Calls {
   static int tensor_map(void* map, int type, unsigned n_dimension, void* address, const std::uint64_t* sizes,
                         const std::uint64_t* strides, const unsigned* box, const unsigned* steps, int interleave,
                         int swizzle, int promotion, int fill) {
-    constexpr int kBf16 = 9, kSwizzle128 = 3;
+    constexpr int kBf16 = 9, kSwizzle32 = 1, kSwizzle128 = 3;
     constexpr std::uint64_t kMostSize = std::uint64_t{1} << 32, kMostStride = std::uint64_t{1} << 40, kElement = 2;
     const auto is_aligned = [](const void* p, std::uintptr_t to) {
       return p != nullptr && reinterpret_cast<std::uintptr_t>(p) % to == 0;
     };
     if (!is_aligned(map, 64) || !is_aligned(address, 16)) return kInvalidValue;
-    if (type != kBf16 || n_dimension != 2 || interleave != 0 || swizzle != kSwizzle128 || fill != 0)
-      return kInvalidValue;
-    if (promotion < 0 || promotion > 3) return kInvalidValue;
-    for (int i = 0; i < 2; ++i)
+    if (type != kBf16 || (n_dimension != 2 && n_dimension != 4) || interleave != 0 || fill != 0) return kInvalidValue;
+    if (promotion < 0 || promotion > 3 || (swizzle != kSwizzle32 && swizzle != kSwizzle128)) return kInvalidValue;
+    TensorMapFields of = {.n_dimension = n_dimension, .address = reinterpret_cast<std::uint64_t>(address)};
+    of.stride[0] = kElement;
+    for (unsigned i = 0; i < n_dimension; ++i) {
       if (sizes[i] == 0 || sizes[i] > kMostSize || box[i] == 0 || box[i] > 256 || steps[i] != 1) return kInvalidValue;
-    if (strides[0] % 16 != 0 || strides[0] >= kMostStride || strides[0] < sizes[0] * kElement) return kInvalidValue;
-    if (box[0] * kElement % 16 != 0 || box[0] * kElement > 128) return kInvalidValue;
-    TensorMapFields of = {.address = reinterpret_cast<std::uint64_t>(address), .n_column = sizes[0], .n_row = sizes[1]};
-    of.stride = strides[0], of.box_columns = box[0], of.box_rows = box[1];
+      of.size[i] = sizes[i], of.box[i] = static_cast<std::uint16_t>(box[i]);
+      if (i == 0) continue;
+      const std::uint64_t before = of.stride[i - 1], stride = of.stride[i] = strides[i - 1];
+      if (stride % 16 != 0 || stride >= kMostStride || stride % before != 0) return kInvalidValue;
+      if (stride < before * sizes[i - 1]) return kInvalidValue;
+    }
+    if (box[0] * kElement % 16 != 0 || box[0] * kElement > (swizzle == kSwizzle32 ? 32 : 128)) return kInvalidValue;
     std::memset(map, 0, sizeof(vla::cuda::TensorMap));
     std::memcpy(map, &of, sizeof(of));
     return 0;

@@ -55,6 +55,13 @@ vla::cuda::TensorMap map_rows(const vla::cuda::MappedRows& of) {
   return map;
 }
 
+vla::cuda::TensorMap map_heads(const vla::cuda::MappedHeads& of) {
+  vla::cuda::TensorMap map = {};
+  const Status made = vla::cuda::map_heads(tensor_map_driver(), of, map);
+  if (!made.ok()) throw Fault(made.error().message());
+  return map;
+}
+
 void launch(const vla::cuda::Launch& how, const void* job, std::size_t job_size) {
   const std::string name = how.kernel;
   const auto refuse = [&](const std::string& why) { throw Fault(name + ": " + why); };

@@ -23,8 +23,9 @@ void launch(const vla::cuda::Launch& how, const Job& job) {
   launch(how, &job, sizeof(job));
 }
 
-/// As the device's driver maps rows. Throws Fault where it refuses to.
+/// As the device's driver maps them. Throws Fault where it refuses to.
 vla::cuda::TensorMap map_rows(const vla::cuda::MappedRows& of);
+vla::cuda::TensorMap map_heads(const vla::cuda::MappedHeads& of);
 
 /// Whether kernels run as PTX: where VLA_CUDA_PTX names files, FILE:FILE.
 bool runs_ptx();

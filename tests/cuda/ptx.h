@@ -35,7 +35,9 @@ struct PtxInstruction {
   bool sign = false, wide_address = false, wide_value = false;  // registers of 8 bytes
   mutable DeviceMemory::Allocation* hint = nullptr;             // where the last access went
   mutable std::uint64_t hint_time = 0;
-  std::vector<std::uint32_t> sums;  // of wgmma
+  std::vector<std::uint32_t> sums;   // of wgmma
+  std::vector<std::uint32_t> of_a;   // of wgmma whose operand a is in registers
+  bool makes_operand = false;        // writes such a register
   WgmmaProduct product;
   bool is_move = false;
   std::string text;
@@ -88,8 +90,8 @@ struct PtxOperation {
 const PtxOperation* find_operation(const std::string& name);
 /// The product of a wgmma, and what runs it; null for others.
 void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, const PtxInstruction&);
-/// What copies a box of a tensor map, to this block or also to others; null for others.
-void (*find_box_copy(const std::string& name, bool& has_mask))(WarpState&, const PtxInstruction&);
+/// What copies a box of a tensor map of so many dimensions, to this block or also to others; null for others.
+void (*find_box_copy(const std::string& name, int& n_dimension, bool& has_mask))(WarpState&, const PtxInstruction&);
 /// Loads (ld) and stores (st) of param, shared and global, and loads of shared::cluster; null for others.
 void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&);
 

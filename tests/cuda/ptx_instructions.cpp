@@ -249,7 +249,10 @@ void run_box_copy(WarpState& w, const PtxInstruction& i) {
     const u64 map = w.lanes<u64>(i.operand[1])[l] - reinterpret_cast<u64>(w.job);
     if (map + sizeof(vla::cuda::TensorMap) > w.job_size) throw Fault("a tensor map that is not in the parameter");
     if (map % alignof(vla::cuda::TensorMap) != 0) throw Fault("a tensor map that is not aligned");
-    const std::size_t to = w.lanes<u32>(i.operand[0])[l], mbarrier = w.lanes<u32>(i.operand[4])[l];
+    const int n = i.count;  // dimensions
+    const std::size_t to = w.lanes<u32>(i.operand[0])[l], mbarrier = w.lanes<u32>(i.operand[2 + n])[l];
+    i32 place[4];
+    for (int d = 0; d < n; ++d) place[d] = w.lanes<i32>(i.operand[2 + d])[l];
     const auto read = [&](std::uintptr_t from, std::size_t size) {
       i.hint = device_memory().check(from, size, false, fresh_hint(i));
       if (w.early >> l & 1 && device_memory().has_result(*i.hint, from, size))
@@ -257,9 +260,9 @@ void run_box_copy(WarpState& w, const PtxInstruction& i) {
       return reinterpret_cast<const std::byte*>(from);
     };
     const std::vector<std::byte> box =
-        copy_box(w.job + map, w.lanes<i32>(i.operand[2])[l], w.lanes<i32>(i.operand[3])[l], to, read);
+        copy_box(w.job + map, std::span(place, static_cast<std::size_t>(n)), to, read);
     if (!kHasMask) return w.shared->bulk_copy(to, box, mbarrier, *w.shared, w.thread(l));
-    const u32 blocks = w.lanes<u32>(i.operand[5])[l] & 0xffff;
+    const u32 blocks = w.lanes<u32>(i.operand[3 + n])[l] & 0xffff;
     for (std::size_t rank = 0; blocks >> rank != 0; ++rank) {
       if ((blocks >> rank & 1) == 0) continue;
       if (rank >= w.cluster.size()) throw Fault("the cluster has no such block");
@@ -299,34 +302,43 @@ void shuffle(WarpState& w, const PtxInstruction& i) {
   }
   std::memcpy(w.lanes<u32>(i.operand[0]), to, sizeof(to));
 }
-/// Takes the sums over from registers, unless they are in flight already.
+/// Takes registers of a product over, unless they are in flight already.
+WgmmaRegisters* take(WarpState& w, const PtxInstruction& i, const std::vector<u32>& places) {
+  const auto first = w.in_flight.find(places[0]);
+  WgmmaRegisters* taken = first == w.in_flight.end() ? nullptr : first->second.first;
+  if (taken == nullptr) taken = &w.wgmma_registers.emplace_back();
+  taken->of.resize(places.size());
+  for (std::size_t r = 0; r < places.size(); ++r) {
+    const auto [at, is_new] = w.in_flight.try_emplace(places[r], taken, r);
+    if (is_new && taken->n_product == 0) std::memcpy(&taken->of[r], w.lanes<u32>(places[r]), sizeof(Lanes));
+    if (at->second != std::pair{taken, r} || (is_new && taken->n_product != 0))
+      fault_at(w, i, 0, "registers of different products");
+  }
+  return taken;
+}
 void wgmma(WarpState& w, const PtxInstruction& i) {
   WgmmaProduct product = i.product;
-  product.a = w.lanes<u64>(i.operand[0])[0], product.b = w.lanes<u64>(i.operand[1])[0];
+  product.a = product.a_in_registers ? 0 : w.lanes<u64>(i.operand[0])[0];
+  product.b = w.lanes<u64>(i.operand[1])[0];
   const u32 adds = w.mask(i.operand[2]);
   for (int l = 0; l < kWarp; ++l)
-    if (w.lanes<u64>(i.operand[0])[l] != product.a || w.lanes<u64>(i.operand[1])[l] != product.b)
+    if ((!product.a_in_registers && w.lanes<u64>(i.operand[0])[l] != product.a) ||
+        w.lanes<u64>(i.operand[1])[l] != product.b)
       fault_at(w, i, l, "lanes of a warp issue different products");
   if (adds != 0 && adds != kAll) fault_at(w, i, 0, "lanes of a warp issue different products");
   product.adds = adds != 0;
-  const auto first = w.in_flight.find(i.sums[0]);
-  WgmmaSums* sums = first == w.in_flight.end() ? nullptr : first->second.first;
-  if (sums == nullptr) sums = &w.sums.emplace_back();
-  sums->of.resize(i.sums.size());
-  for (std::size_t r = 0; r < i.sums.size(); ++r) {
-    const auto [at, is_new] = w.in_flight.try_emplace(i.sums[r], sums, r);
-    if (is_new && sums->n_product == 0) std::memcpy(&sums->of[r], w.lanes<u32>(i.sums[r]), sizeof(Lanes));
-    if (at->second != std::pair{sums, r} || (is_new && sums->n_product != 0))
-      fault_at(w, i, 0, "sums of different products");
-  }
-  guarded(w, i, 0, [&] { w.wgmma.issue(product, *sums); });
+  for (const u32 place : i.of_a)
+    if (w.unfenced.contains(place)) fault_at(w, i, 0, "registers written without wgmma.fence after it");
+  WgmmaRegisters* const a = product.a_in_registers ? take(w, i, i.of_a) : nullptr;
+  WgmmaRegisters* const sums = take(w, i, i.sums);
+  guarded(w, i, 0, [&] { w.wgmma.issue(product, *sums, a); });
 }
 void wgmma_wait(WarpState& w, const PtxInstruction& i) {
   guarded(w, i, 0, [&] { w.wgmma.wait(w.lanes<u32>(i.operand[0])[0]); });
-  for (const auto& [place, sum] : w.in_flight)
-    if (sum.first->n_product == 0) std::memcpy(w.lanes<u32>(place), &sum.first->of[sum.second], sizeof(Lanes));
+  for (const auto& [place, taken] : w.in_flight)
+    if (taken.first->n_product == 0) std::memcpy(w.lanes<u32>(place), &taken.first->of[taken.second], sizeof(Lanes));
   std::erase_if(w.in_flight, [](const auto& one) { return one.second.first->n_product == 0; });
-  std::erase_if(w.sums, [](const WgmmaSums& sums) { return sums.n_product == 0; });
+  std::erase_if(w.wgmma_registers, [](const WgmmaRegisters& one) { return one.n_product == 0; });
 }
 void warp_barrier(WarpState& w, const PtxInstruction&) { w.shared->warp_barrier(w.number); }
 
@@ -506,7 +518,7 @@ const PtxOperation kOperations[] = {
     {"mbarrier.arrive.shared::cluster.b64", "_s", arrive_at_block},
     {"mbarrier.try_wait.parity.shared::cta.b64", "psd", try_wait},
     {"cvta.param.u64", "qq", address_of_param},
-    {"wgmma.fence.sync.aligned", "", [](WarpState& w, const PtxInstruction&) { w.wgmma.fence(); },
+    {"wgmma.fence.sync.aligned", "", [](WarpState& w, const PtxInstruction&) { w.wgmma.fence(), w.unfenced.clear(); },
      PtxInstruction::kWarp},
     {"wgmma.commit_group.sync.aligned", "", [](WarpState& w, const PtxInstruction&) { w.wgmma.commit(); },
      PtxInstruction::kWarp},
@@ -535,13 +547,13 @@ bool renames(WarpState& w, const PtxInstruction& i) {
   const auto found = i.is_move ? w.in_flight.find(i.operand[1]) : w.in_flight.end();
   if (i.is_move) w.in_flight.erase(i.operand[0]);
   if (found != w.in_flight.end()) {
-    if (w.active != kAll) fault_at(w, i, 0, "touches sums of wgmma that it has not waited for");
+    if (w.active != kAll) fault_at(w, i, 0, "touches registers of wgmma that it has not waited for");
     const auto sum = found->second;
     w.in_flight[i.operand[0]] = sum;
     return true;
   }
   for (int k = 0; k < i.n_operand; ++k)
-    if (w.in_flight.contains(i.operand[k])) fault_at(w, i, 0, "touches sums of wgmma that it has not waited for");
+    if (w.in_flight.contains(i.operand[k])) fault_at(w, i, 0, "touches registers of wgmma that it has not waited for");
   return false;
 }
 
@@ -567,11 +579,15 @@ void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, c
   return wgmma;
 }
 
-void (*find_box_copy(const std::string& name, bool& has_mask))(WarpState&, const PtxInstruction&) {
-  const std::string own = "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes";
-  has_mask = name != own;
-  if (!has_mask) return run_box_copy<false>;
-  return name == own + ".multicast::cluster" ? run_box_copy<true> : nullptr;
+void (*find_box_copy(const std::string& name, int& n_dimension, bool& has_mask))(WarpState&, const PtxInstruction&) {
+  const std::string start = "cp.async.bulk.tensor.", end = "d.shared::cluster.global.mbarrier::complete_tx::bytes";
+  for (const int n : {2, 4})
+    for (const bool is_for_others : {false, true}) {
+      if (name != start + std::to_string(n) + end + (is_for_others ? ".multicast::cluster" : "")) continue;
+      n_dimension = n, has_mask = is_for_others;
+      return is_for_others ? run_box_copy<true> : run_box_copy<false>;
+    }
+  return nullptr;
 }
 
 void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&) {

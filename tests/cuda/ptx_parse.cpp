@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cstdlib>
 #include <cstring>
+#include <set>
 #include <sstream>
 #include <string_view>
 #include <unordered_map>
@@ -74,9 +75,14 @@ class Reader {
     };
     for (PtxInstruction& one : kernel_.code) {
       for (int i = 0; i < one.n_operand; ++i) one.operand[i] = shift(one.operand[i]);
-      for (std::uint32_t& place : one.sums) place = shift(place);
+      for (auto* places : {&one.sums, &one.of_a})
+        for (std::uint32_t& place : *places) place = shift(place);
       if (one.has_guard) one.guard = shift(one.guard);
     }
+    std::set<std::uint32_t> operands;
+    for (const PtxInstruction& one : kernel_.code) operands.insert(one.of_a.begin(), one.of_a.end());
+    for (PtxInstruction& one : kernel_.code)
+      one.makes_operand = one.kind == PtxInstruction::kPlain && one.n_operand > 0 && operands.contains(one.operand[0]);
     for (PtxKernel::Special& special : kernel_.specials) special.place = shift(special.place);
     for (PtxKernel::SharedAddress& address : kernel_.dynamic_shared) address.place = shift(address.place);
     kernel_.register_bytes = size + n_byte_;
@@ -242,30 +248,42 @@ class Reader {
     }
   }
 
-  /// Sums, descriptors of a and b, whether it adds; of floats also that nothing is negated or transposed.
+  /// Sums, a's descriptor or four registers, b's descriptor, whether it adds; of floats also that nothing is negated, and
+  /// whether a and b are transposed, which a in registers cannot be.
   void decode_wgmma(PtxInstruction& one, const std::string& name, const std::vector<std::string>& operands) {
     one.run = find_wgmma(name, one.product), one.kind = PtxInstruction::kWarp;
     if (one.run == nullptr) throw Fault("unknown instruction " + name);
     const auto n_sum = static_cast<std::size_t>(one.product.n / 2);
-    std::vector<std::string> tail = {"1", "1", "0", "0"};
-    if (one.product.kind == WgmmaProduct::s8) tail.clear();
-    if (operands.size() != n_sum + 3 + tail.size()) throw Fault("another number of operands");
-    if (!std::equal(tail.begin(), tail.end(), operands.end() - static_cast<std::ptrdiff_t>(tail.size())))
-      throw Fault("wgmma that negates or transposes");
+    const bool is_bf16 = one.product.kind == WgmmaProduct::bf16;
+    one.product.a_in_registers = is_bf16 && operands.size() == n_sum + 9;
+    std::vector<std::string> tail = {"1", "1", "0"};
+    if (!is_bf16 || one.product.a_in_registers) tail.resize(is_bf16 ? 2 : 0);
+    const std::size_t n_of_a = one.product.a_in_registers ? 4 : 1, first = n_sum + n_of_a + 2;
+    if (operands.size() != first + tail.size() + (is_bf16 ? 1 : 0)) throw Fault("another number of operands");
+    if (!std::equal(tail.begin(), tail.end(), operands.begin() + static_cast<std::ptrdiff_t>(first)))
+      throw Fault("wgmma that negates, or transposes a");
+    if (is_bf16 && operands.back() != "0" && operands.back() != "1") throw Fault("wgmma that transposes otherwise");
+    one.product.b_transposed = is_bf16 && operands.back() == "1";
     for (std::size_t i = 0; i < n_sum; ++i) one.sums.push_back(operand(operands[i], 'd'));
-    for (std::size_t i = 0; i < 3; ++i) one.operand[one.n_operand++] = operand(operands[n_sum + i], "qqp"[i]);
+    for (std::size_t i = 0; one.product.a_in_registers && i < n_of_a; ++i)
+      one.of_a.push_back(operand(operands[n_sum + i], 'd'));
+    const std::size_t b = n_sum + n_of_a;
+    for (const std::size_t i : {one.product.a_in_registers ? b : n_sum, b})
+      one.operand[one.n_operand++] = operand(operands[i], 'q');
+    one.operand[one.n_operand++] = operand(operands[b + 1], 'p');
   }
 
-  /// [to], [map, {column, row}], [mbarrier] and perhaps the mask of blocks.
+  /// [to], [map, {a place}], [mbarrier] and perhaps the mask of blocks.
   void decode_box_copy(PtxInstruction& one, const std::string& name, const std::vector<std::string>& operands) {
     bool has_mask = false;
-    one.run = find_box_copy(name, has_mask);
+    one.run = find_box_copy(name, one.count, has_mask);
     if (one.run == nullptr) throw Fault("unknown instruction " + name);
-    if (operands.size() != (has_mask ? 6U : 5U)) throw Fault("another number of operands");
+    if (operands.size() != static_cast<std::size_t>(one.count) + (has_mask ? 4U : 3U))
+      throw Fault("another number of operands");
     for (std::size_t i = 0; i < operands.size(); ++i) {
       std::string word = operands[i];
       std::erase_if(word, [](char c) { return c == '[' || c == ']'; });
-      one.operand[one.n_operand++] = operand(word, "dqdddd"[i]);
+      one.operand[one.n_operand++] = operand(word, i == 1 ? 'q' : 'd');
     }
   }
 

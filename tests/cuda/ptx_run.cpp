@@ -57,6 +57,7 @@ Stop run_warp(WarpState& w, const PtxKernel& kernel) {
       case PtxInstruction::kPlain:
         w.active = active;
         if (active != 0 && (w.in_flight.empty() || !renames(w, i))) i.run(w, i);
+        if (i.makes_operand) w.unfenced.insert(i.operand[0]);
         break;
       case PtxInstruction::kBranch:
         jumps = active;
@@ -134,7 +135,8 @@ void begin_block(const Cluster& cluster, Block& block, BlockIndex at, std::size_
     w.number = static_cast<int>(i), w.job = static_cast<const std::byte*>(job), w.job_size = kernel.param_size;
     w.shared = &shared, w.cluster = cluster.shared, w.arrival = WarpState::kAway;
     w.stop = Stop::none, w.waits_for_phase = false;
-    w.wgmma.begin(shared, w.number), w.in_flight.clear(), w.sums.clear();
+    w.wgmma.begin(shared, w.number), w.in_flight.clear(), w.wgmma_registers.clear();
+    w.unfenced.clear();
     w.registers.resize(kernel.register_bytes);
     std::copy(kernel.constants.begin(), kernel.constants.end(), w.registers.begin());
     for (const PtxKernel::Special& special : kernel.specials) {

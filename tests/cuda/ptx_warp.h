@@ -4,6 +4,7 @@
 
 #include <list>
 #include <map>
+#include <set>
 #include <span>
 #include <utility>
 #include <vector>
@@ -42,8 +43,9 @@ struct WarpState {
   enum class Stop { none, end, barrier, cluster, mbarrier } stop = Stop::none;
   bool waits_for_phase = false;  // a phase of an mbarrier has not ended yet
   Wgmma wgmma;
-  std::list<WgmmaSums> sums;                                    // in flight
-  std::map<u32, std::pair<WgmmaSums*, std::size_t>> in_flight;  // registers of such sums
+  std::list<WgmmaRegisters> wgmma_registers;                         // in flight
+  std::map<u32, std::pair<WgmmaRegisters*, std::size_t>> in_flight;  // registers of such
+  std::set<u32> unfenced;  // registers of operand a that were written since the last wgmma.fence
 
   template <class T>
   T* lanes(u32 place) {
@@ -53,7 +55,7 @@ struct WarpState {
   int thread(int lane) const { return number * kWarp + lane; }
 };
 
-/// While sums are in flight, other instructions than wgmma may only rename their registers. Whether that was done.
+/// While products are in flight, other instructions than wgmma may only rename their registers. Whether that was done.
 bool renames(WarpState& w, const PtxInstruction& i);
 
 }  // namespace vla::test::cuda

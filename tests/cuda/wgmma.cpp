@@ -15,25 +15,45 @@ namespace {
 constexpr std::size_t kChunk = 16;       // bytes that swizzling moves together
 constexpr std::size_t kDepthBytes = 32;  // of a product
 
-/// An operand in shared memory, as its matrix descriptor says.
+/// An operand in shared memory, as its matrix descriptor says: rows of 128 or 32 bytes, which are swizzled. A transposed
+/// one has a row for each element of the depth. Source: PTX ISA 9.0, "Strides"; the canonical layouts in CUTLASS,
+/// include/cute/atom/mma_traits_sm90_gmma.hpp, and include/types/shared/descriptor.cuh of ThunderKittens say the same.
 class Operand {
  public:
-  explicit Operand(std::uint64_t descriptor)
-      : first_((descriptor & 0x3fff) << 4), stride_((descriptor >> 32 & 0x3fff) << 4) {
+  explicit Operand(std::uint64_t descriptor, bool transposed = false, int n = 0)
+      : first_(field(descriptor, 0)),
+        next_(field(descriptor, 16)),
+        stride_(field(descriptor, 32)),
+        is_transposed_(transposed) {
     constexpr std::uint64_t kKnown = 0xc000'3fff'3fff'3fff;
+    const std::uint64_t swizzling = descriptor >> 62;
     if ((descriptor & ~kKnown) != 0) throw Fault("a matrix descriptor with bits that are not known");
-    if (descriptor >> 62 != 1) throw Fault("a matrix descriptor without swizzling over 128 bytes");
+    if (swizzling != 1 && swizzling != 3) throw Fault("a matrix descriptor without swizzling over 128 or 32 bytes");
+    row_ = swizzling == 1 ? 128 : 32;
+    if (!transposed) return;
+    if (first_ % (8 * row_) != 0) throw Fault("a transposed matrix that begins between eight rows");
+    if (static_cast<std::size_t>(n) % (row_ / 2) != 0) throw Fault("a transposed matrix with a part of a row");
   }
-  /// Offset of 16 bytes of a row.
+  /// Offset of 16 bytes of a row; those of a transposed matrix go on in rows further on.
   std::size_t chunk(int row, int which) const {
-    const auto r = static_cast<std::size_t>(row);
-    const std::size_t plain = first_ + r / 8 * stride_ + r % 8 * 128 + static_cast<std::size_t>(which) * kChunk;
-    return plain ^ (plain >> 7 & 7) << 4;
+    const auto r = static_cast<std::size_t>(row), at = static_cast<std::size_t>(which) * kChunk;
+    const std::size_t of_row = first_ + r / 8 * stride_ + r % 8 * row_;
+    const std::size_t plain = is_transposed_ ? of_row + at / row_ * next_ + at % row_ : of_row + at;
+    return plain ^ (plain >> 7 & (row_ / kChunk - 1)) << 4;
   }
 
  private:
-  std::size_t first_, stride_;
+  static std::size_t field(std::uint64_t descriptor, int bit) { return (descriptor >> bit & 0x3fff) << 4; }
+
+  std::size_t first_, next_, stride_, row_ = 0;
+  bool is_transposed_;
 };
+
+/// Number k of a row of operand a in registers, as mma_bf16 takes it (fragments.h).
+float of_register(const WgmmaRegisters& a, int row, int k) {
+  const auto lane = static_cast<std::size_t>(row % 8 * 4 + k % 8 / 2);
+  return bf16_to_float(a.of[static_cast<std::size_t>(row / 8 + k / 8 * 2)][lane] >> k % 2 * 16 & 0xffff);
+}
 
 }  // namespace
 
@@ -42,10 +62,11 @@ void Wgmma::begin(SharedMemory& shared, int warp) {
   shared_ = &shared, warp_ = warp;
 }
 
-void Wgmma::issue(const WgmmaProduct& product, WgmmaSums& sums) {
+void Wgmma::issue(const WgmmaProduct& product, WgmmaRegisters& sums, WgmmaRegisters* a) {
   if (sums.n_product == 0 && !is_fenced_) throw Fault("wgmma without wgmma.fence before it");
   ++n_issued_, ++sums.n_product, ++counts.mma;
-  const Product one = {product, &sums};
+  if (a != nullptr) ++a->n_product;
+  const Product one = {product, &sums, a};
   read(one);
   if (!schedule.late_copies) compute(one);
   open_.push_back(one);
@@ -60,11 +81,11 @@ void Wgmma::wait(std::size_t n_left) {
   for (; committed_.size() > n_left; committed_.pop_front(), ++n_done_) {
     for (const Product& product : committed_.front()) {
       if (schedule.late_copies) compute(product);
-      --product.sums->n_product;
+      if (product.in_registers != nullptr) --product.in_registers->n_product;
+      if (--product.sums->n_product == 0) is_fenced_ = false;  // other instructions may touch these sums
     }
     shared_->async_done(warp_, n_done_);
   }
-  if (is_idle()) is_fenced_ = false;  // sums are free for other instructions
 }
 
 void Wgmma::end() const {
@@ -73,11 +94,14 @@ void Wgmma::end() const {
 
 /// Notes what a product reads, so that nobody writes it before the product was waited for.
 void Wgmma::read(const Product& product) const {
-  const Operand a(product.a), b(product.b);
-  for (int which = 0; which < static_cast<int>(kDepthBytes / kChunk); ++which) {
-    for (int row = 0; row < 16; ++row) shared_->async_read(a.chunk(warp_ % 4 * 16 + row, which), warp_, n_group_);
-    for (int row = 0; row < product.n; ++row) shared_->async_read(b.chunk(row, which), warp_, n_group_);
-  }
+  const auto read = [&](const Operand& from, int first, int end, int n_chunk) {
+    for (int row = first; row < end; ++row)
+      for (int which = 0; which < n_chunk; ++which) shared_->async_read(from.chunk(row, which), warp_, n_group_);
+  };
+  constexpr int kChunks = kDepthBytes / kChunk;
+  if (!product.a_in_registers) read(Operand(product.a), warp_ % 4 * 16, warp_ % 4 * 16 + 16, kChunks);
+  const Operand b(product.b, product.b_transposed, product.n);
+  product.b_transposed ? read(b, 0, product.depth(), product.n / 8) : read(b, 0, product.n, kChunks);
 }
 
 /// As mma_bf16 and mma_s8 (fragments.h): products are exact, and added in float32 one after the other, or exactly.
@@ -95,15 +119,25 @@ void Wgmma::compute(const Product& product) const {
       to[k] = kIsBf16 ? bf16_to_float(half) : static_cast<float>(static_cast<std::int8_t>(bytes[k]));
     }
   };
-  const Operand a(product.a), b(product.b);
+  const auto load_column = [&](const Operand& from, int column, float(&to)[kDepth]) {
+    for (int k = 0; k < kDepth; ++k) {
+      std::uint16_t half = 0;
+      std::memcpy(&half, shared_->data() + from.chunk(k, column / 8) + column % 8 * 2, 2);
+      to[k] = bf16_to_float(half);
+    }
+  };
   Eight rows[kDepth][2];
   float one[kDepth];
   for (int row = 0; row < 16; ++row) {
-    load(a, warp_ % 4 * 16 + row, one);
+    if (product.a_in_registers)
+      for (int k = 0; k < kDepth; ++k) one[k] = of_register(*product.in_registers, row, k);
+    else
+      load(Operand(product.a), warp_ % 4 * 16 + row, one);
     for (int k = 0; k < kDepth; ++k) rows[k][row / 8][row % 8] = one[k];
   }
+  const Operand b(product.b, product.b_transposed, product.n);
   for (int column = 0; column < product.n; ++column) {
-    load(b, column, one);
+    product.b_transposed ? load_column(b, column, one) : load(b, column, one);
     Eight sum[2] = {};
     std::uint32_t* to[16];
     for (int row = 0; row < 16; ++row) {

@@ -12,21 +12,21 @@
 
 namespace vla::test::cuda {
 
-/// A warp's sums of products that were issued: each register, lane by lane.
-struct WgmmaSums {
+/// Registers of a warp that products which were issued use, sums or operand a: each register, lane by lane.
+struct WgmmaRegisters {
   std::vector<std::array<std::uint32_t, kWarp>> of;
   int n_product = 0;  // that have not been waited for
 };
 
 /// The products of a warp, which has 16 of its warpgroup's 64 rows. Operands are read when a product is issued or as
-/// late as it is waited for, as schedule.late_copies says; both are a GPU's. Until then its sums are nobody's to touch.
+/// late as it is waited for, as schedule.late_copies says; both are a GPU's. Until then its registers are nobody's to touch.
 /// Source: PTX ISA 9.0, "Asynchronous Warpgroup Level Matrix Multiply-Accumulate Instructions".
 class Wgmma {
  public:
   void begin(SharedMemory& shared, int warp);
   void fence() { is_fenced_ = true; }
-  /// `sums` must stay where they are until they have no product.
-  void issue(const WgmmaProduct& product, WgmmaSums& sums);
+  /// `sums`, and `a` if that is in registers, must stay where they are until they have no product.
+  void issue(const WgmmaProduct& product, WgmmaRegisters& sums, WgmmaRegisters* a);
   void commit();
   void wait(std::size_t n_left);
   /// A Fault where a product was not waited for.
@@ -35,7 +35,7 @@ class Wgmma {
 
  private:
   struct Product : WgmmaProduct {
-    WgmmaSums* sums;
+    WgmmaRegisters *sums, *in_registers;
   };
   void read(const Product& product) const;
   template <int kDepth>

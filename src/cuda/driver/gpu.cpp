@@ -96,15 +96,36 @@ Result<std::vector<GpuInfo>> list_gpus(const Driver& driver) {
   return all;
 }
 
+namespace {
+
+/// Encodes a map of bf16 whose boxes are swizzled over their rows. Strides are in elements and begin with the second
+/// dimension's.
+template <unsigned kDimensions>
+Status encode_map(const Driver& driver, const void* data, const std::int64_t (&sizes)[kDimensions],
+                  const std::int64_t (&strides)[kDimensions - 1], const int (&box)[kDimensions], TensorMap& map) {
+  constexpr int kBf16 = 9, kNoInterleave = 0, kSwizzle32 = 1, kSwizzle128 = 3, kPromote256 = 3, kZeros = 0;
+  std::uint64_t size[kDimensions], stride[kDimensions - 1];
+  unsigned box_size[kDimensions], steps[kDimensions];
+  for (unsigned i = 0; i < kDimensions; ++i) {
+    size[i] = static_cast<std::uint64_t>(sizes[i]), box_size[i] = static_cast<unsigned>(box[i]), steps[i] = 1;
+    if (i > 0) stride[i - 1] = static_cast<std::uint64_t>(strides[i - 1]) * sizeof(std::uint16_t);
+  }
+  return check_call(
+      driver, "tensor_map",
+      driver.tensor_map(&map, kBf16, kDimensions, const_cast<void*>(data), size, stride, box_size, steps, kNoInterleave,
+                        box[0] == 16 ? kSwizzle32 : kSwizzle128, kPromote256, kZeros));
+}
+
+}  // namespace
+
 Status map_rows(const Driver& driver, const MappedRows& of, TensorMap& map) {
-  constexpr int kBf16 = 9, kNoInterleave = 0, kSwizzle128 = 3, kPromote256 = 3, kZeros = 0;
-  constexpr unsigned kBoxDepth = 64;  // 128 bytes
-  const std::uint64_t sizes[] = {static_cast<std::uint64_t>(of.depth), static_cast<std::uint64_t>(of.n_row)};
-  const std::uint64_t strides[] = {static_cast<std::uint64_t>(of.stride) * sizeof(*of.rows)};
-  const unsigned box[] = {kBoxDepth, static_cast<unsigned>(of.box_rows)}, steps[] = {1, 1};
-  return check_call(driver, "tensor_map",
-                    driver.tensor_map(&map, kBf16, 2, const_cast<std::uint16_t*>(of.rows), sizes, strides, box, steps,
-                                      kNoInterleave, kSwizzle128, kPromote256, kZeros));
+  constexpr int kBoxDepth = 64;  // 128 bytes
+  return encode_map<2>(driver, of.rows, {of.depth, of.n_row}, {of.stride}, {kBoxDepth, of.box_rows}, map);
+}
+
+Status map_heads(const Driver& driver, const MappedHeads& of, TensorMap& map) {
+  return encode_map<4>(driver, of.data, {of.d_head, of.n_head, of.n_token, of.n_batch}, {of.head, of.token, of.batch},
+                       {of.box_columns, 1, of.box_tokens, 1}, map);
 }
 
 Status Gpu::check(const char* call, int result) const { return check_call(driver_, call, result); }

@@ -109,6 +109,9 @@ Result<std::vector<GpuInfo>> list_gpus(const Driver& driver);
 /// Makes `map` one for copies of boxes of box_rows rows and 128 bytes of the depth, swizzled as wgmma takes them
 /// (hopper.h). What is outside of the rows and the depth is zeros. Nothing is read; the rows need not be there yet.
 Status map_rows(const Driver& driver, const MappedRows& of, TensorMap& map);
+/// The same for boxes of box_tokens tokens and box_columns columns of one head in one batch. Places are column, head,
+/// token and batch.
+Status map_heads(const Driver& driver, const MappedHeads& of, TensorMap& map);
 
 class Gpu {
  public:
@@ -144,6 +147,7 @@ class Gpu {
   Result<Stream> stream();
   /// For Hopper, see above.
   Status map_rows(const MappedRows& of, TensorMap& map) const { return cuda::map_rows(driver_, of, map); }
+  Status map_heads(const MappedHeads& of, TensorMap& map) const { return cuda::map_heads(driver_, of, map); }
   /// Creates an event: with time for Stream::note_time, without for Stream::record.
   Result<Owned> event(bool has_time);
   /// Milliseconds between two recorded events.

@@ -88,8 +88,17 @@ VLA_DEVICE void copy_box_to_blocks(std::byte* to, const TensorMap& map, int colu
       "l"(&map), "r"(column), "r"(row), "r"(shared_address(mbarrier)), "h"(static_cast<unsigned short>(blocks))
       : "memory");
 }
+/// Copies a box of a map of heads likewise, from (column, token) on of one head in one batch.
+VLA_DEVICE void copy_box_of_head(std::byte* to, const TensorMap& map, int column, int head, int token, int batch,
+                                 std::byte* mbarrier) {
+  asm volatile(
+      "cp.async.bulk.tensor.4d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3, %4, %5}], "
+      "[%6];" ::"r"(shared_address(to)),
+      "l"(&map), "r"(column), "r"(head), "r"(token), "r"(batch), "r"(shared_address(mbarrier))
+      : "memory");
+}
 
-/// Must precede the first wgmma, and each wgmma after other instructions have read or written the sums.
+/// Must precede the first wgmma, and each wgmma after other instructions have touched its registers.
 VLA_DEVICE void wgmma_fence() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }
 VLA_DEVICE void wgmma_commit() { asm volatile("wgmma.commit_group.sync.aligned;" ::: "memory"); }
 /// Waits until all but the latest kLeft groups of this warpgroup have ended: then their operands may be overwritten.
@@ -97,17 +106,27 @@ template <int kLeft>
 VLA_DEVICE void wgmma_wait() {
   asm volatile("wgmma.wait_group.sync.aligned %0;" ::"n"(kLeft) : "memory");
 }
-/// Waits for all groups: then sums may be read.
+/// Nothing that computes or reads these registers moves across it.
+template <class T, int kCount>
+VLA_DEVICE void pin(T (&registers)[kCount]) {
+#pragma unroll
+  for (int i = 0; i < kCount; ++i) {
+    if constexpr (T(0.5f) == T(0))
+      asm volatile("" : "+r"(registers[i])::"memory");
+    else
+      asm volatile("" : "+f"(registers[i])::"memory");
+  }
+}
+/// Waits likewise: then these sums may be read.
+template <int kLeft, class T, int kCount>
+VLA_DEVICE void wgmma_wait_for(T (&sum)[kCount]) {
+  wgmma_wait<kLeft>();
+  pin(sum);
+}
+/// Waits for all groups.
 template <class T, int kCount>
 VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
-  wgmma_wait<0>();
-#pragma unroll
-  for (int i = 0; i < kCount; ++i) {  // no read of a sum moves before the wait
-    if constexpr (T(0.5f) == T(0))
-      asm volatile("" : "+r"(sum[i])::"memory");
-    else
-      asm volatile("" : "+f"(sum[i])::"memory");
-  }
+  wgmma_wait_for<0>(sum);
 }
 
 // clang-format off
@@ -167,6 +186,14 @@ VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
   VLA_WGMMA(224, 112, 113, 114, shape, tail, c);       \
   VLA_WGMMA(240, 120, 121, 122, shape, tail, c);       \
   VLA_WGMMA(256, 128, 129, 130, shape, tail, c)
+// The same with operand a in four registers, and operand b as its descriptor's columns of the depth. pb: the number of
+// operand b, which follows them.
+#define VLA_WGMMA_OF_REGISTERS(n, half, a0, a1, a2, a3, pb)                                                          \
+  if constexpr (kN == n)                                                                                             \
+    asm volatile("{\n.reg .pred adds;\nsetp.eq.u32 adds, 0, 0;\n"                                                    \
+                 "wgmma.mma_async.sync.aligned.m64n" #n "k16.f32.bf16.bf16 {" VLA_R##half "}, {%" #a0 ", %" #a1      \
+                 ", %" #a2 ", %" #a3 "}, %" #pb ", adds, 1, 1, 1;\n}"                                                \
+                 : VLA_S##half("+f") : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "l"(b) : "memory")
 // clang-format on
 
 /// sum[64, kN] (+)= a[64, 16] * b[kN, 16]^T of bf16 with sums in float32; `adds` keeps the old sums.
@@ -176,6 +203,18 @@ template <int kN>
 VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
   static_assert(kN % 16 == 0 && kN >= 48 && kN <= 256);
   VLA_WGMMA_OF_ANY_SIZE("k16.f32.bf16.bf16", ", 1, 1, 0, 0", "+f");
+}
+
+/// sum[64, kN] += a[64, 16] * b[16, kN] of bf16. a is in registers, which nobody may touch before the product was waited
+/// for: in each warp those of operand a of dev::multiply_bf16. b is a descriptor of shared memory, see
+/// transposed_descriptor.
+template <int kN>
+VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], const unsigned (&a)[4], std::uint64_t b) {
+  static_assert(kN == 64 || kN == 80 || kN == 128 || kN == 256);
+  VLA_WGMMA_OF_REGISTERS(64, 32, 32, 33, 34, 35, 36);
+  VLA_WGMMA_OF_REGISTERS(80, 40, 40, 41, 42, 43, 44);
+  VLA_WGMMA_OF_REGISTERS(128, 64, 64, 65, 66, 67, 68);
+  VLA_WGMMA_OF_REGISTERS(256, 128, 128, 129, 130, 131, 132);
 }
 
 /// sum[64, kN] (+)= a[64, 32] * b[kN, 32]^T of signed bytes, exactly, else as wgmma_bf16.
@@ -191,15 +230,27 @@ VLA_DEVICE void wgmma_s8(int (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, b
 
 namespace vla::cuda {
 
-/// Operands of wgmma are rows of 128 bytes of the depth. Eight rows take 1024 bytes and are aligned to 1024 bytes.
-/// The 16-byte chunks of a row are permuted by the row's number: swizzling over 128 bytes.
+/// Operands of wgmma are rows of kRow bytes, 128 or 32: of the depth, or of b's columns where b is transposed. Eight rows
+/// follow each other and are aligned to their size. The 16-byte chunks of rows are permuted by the rows' addresses:
+/// swizzling over kRow bytes. Source: PTX ISA 9.0, "Strides", "Matrix descriptor format".
 constexpr int kSwizzledRow = 128, kSwizzledRows = 8;
-VLA_DEVICE int swizzled(int row, int chunk) { return row * kSwizzledRow + (chunk ^ row % kSwizzledRows) * 16; }
+template <int kRow = kSwizzledRow>
+VLA_DEVICE int swizzled(int row, int chunk) {
+  static_assert(kRow == 128 || kRow == 32);
+  return row * kRow + (chunk ^ row * kRow / 128 % (kRow / 16)) * 16;
+}
 
-/// The matrix descriptor of such rows. To advance by k bytes of the depth, add k / 16.
+/// The matrix descriptor of such rows. To advance by k bytes of a row, add k / 16.
+template <int kRow = kSwizzledRow>
 VLA_DEVICE std::uint64_t swizzled_descriptor(const std::byte* rows) {
-  constexpr std::uint64_t kSwizzle128 = std::uint64_t{1} << 62, kStride = kSwizzledRow * kSwizzledRows / 16;
-  return (dev::shared_address(rows) & 0x3ffffU) >> 4 | std::uint64_t{1} << 16 | kStride << 32 | kSwizzle128;
+  constexpr std::uint64_t kSwizzling = std::uint64_t{kRow == 128 ? 1 : 3} << 62, kStride = kRow * kSwizzledRows / 16;
+  return (dev::shared_address(rows) & 0x3ffffU) >> 4 | std::uint64_t{1} << 16 | kStride << 32 | kSwizzling;
+}
+/// The matrix descriptor of a transposed b: a row for each element of the depth, with kRow / 2 columns. Further columns
+/// are in rows that lie `next` bytes on. To advance by 16 of the depth, add kRow.
+template <int kRow>
+VLA_DEVICE std::uint64_t transposed_descriptor(const std::byte* rows, int next) {
+  return (swizzled_descriptor<kRow>(rows) & ~(std::uint64_t{0x3fff} << 16)) | static_cast<std::uint64_t>(next / 16) << 16;
 }
 
 }  // namespace vla::cuda

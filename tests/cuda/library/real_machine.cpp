@@ -106,6 +106,13 @@ TensorMap map_rows(const MappedRows& of) {
   return map;
 }
 
+TensorMap map_heads(const MappedHeads& of) {
+  TensorMap map = {};
+  const Status made = machine().gpu->map_heads(of, map);
+  if (!made.ok()) throw Fault(made.error().message());
+  return map;
+}
+
 void launch(const Launch& how, const void* job, std::size_t) {
   Machine& m = machine();
   Status status = m.gpu->use();
