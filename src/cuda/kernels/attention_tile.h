@@ -23,6 +23,7 @@ struct AttentionBlock {
   static constexpr int kDepth = kOf.depth, kRows = kOf.rows, kGroups = kOf.key_groups, kKeys = kOf.keys;
   static constexpr int kThreads = kOf.n_thread(), kRowGroups = kRows / 16;
   static constexpr bool kShares = kGroups > 1;  // whether warps share the keys of a tile
+  static constexpr bool kTakesMask = true;
   static constexpr int kRow = kOf.row(), kTile = kKeys * kRow, kSumsRow = kOf.sums_row();
   VLA_DEVICE static constexpr int weight_row() { return kKeys * 2 + 16; }
   static constexpr bool kKeepsQ = kDepth <= 128;  // queries in registers
@@ -118,7 +119,7 @@ class AttentionWarp {
  public:
   VLA_DEVICE AttentionWarp(const AttentionJob& job, const Unit& unit, int n_key)
       : job_(job), unit_(unit), row0_(static_cast<int>(blockIdx.x) * S::kRows + row_group() * 16) {
-    if (job.mask == nullptr) return;
+    if (!has_mask()) return;
 #pragma unroll
     for (int h = 0; h < 2; ++h) {
       const int row = row0_ + lane() / 4 + h * 8;
@@ -133,7 +134,7 @@ class AttentionWarp {
   /// Initializes the scores of the tile that begins at key `first`: mask or 0, and minus infinity from key `last` on.
   VLA_DEVICE void begin_scores(int first, int last) {
     const int key = key_group() * S::kOwnKeys + lane() % 4 * 2, n_key = last - first - key;
-    if (job_.mask == nullptr) {
+    if (!has_mask()) {
       const bool is_whole = last - first >= S::kKeys;
       each_score([&](float& one, int, int at) { one = is_whole || at < n_key ? 0 : kMinusInfinity; });
     } else {
@@ -144,7 +145,7 @@ class AttentionWarp {
   /// Divides the mask by the scale, which scores get later. A separate step gives the mask's loads time to finish.
   VLA_DEVICE void unscale_mask() {
     const float unit = 1 / job_.scale;
-    if (job_.mask != nullptr) each_score([&](float& one, int, int) { one *= unit; });
+    if (has_mask()) each_score([&](float& one, int, int) { one *= unit; });
   }
   VLA_DEVICE void keep_queries(const std::byte* q) {
     if constexpr (S::kKeepsQ)
@@ -293,7 +294,13 @@ class AttentionWarp {
     for (int h = 0; h < 2; ++h) store_row<kInCluster>(row0_ + lane() / 4 + h * 8, h, sums);
   }
 
+ protected:
+  const AttentionJob& job_;
+  float scores_[S::kOwnKeys / 8][4], y_[S::kSums][S::kTiles][4] = {};
+  float most_[2] = {kMinusInfinity, kMinusInfinity}, total_[2] = {};
+
  private:
+  VLA_DEVICE bool has_mask() const { return S::kTakesMask && job_.mask != nullptr; }
   /// Calls change(score, half of the rows, key minus the lane's first key) for each score.
   template <class Change>
   VLA_DEVICE void each_score(Change change) {
@@ -344,13 +351,10 @@ class AttentionWarp {
         store_pair(job_.y, job_.is_bf16, at + column + n * 8, y_[0][n][2 * h] * share, y_[0][n][2 * h + 1] * share);
   }
 
-  const AttentionJob& job_;
   const Unit& unit_;
   int row0_;
   const float* mask_[2] = {};  // the mask's rows for the lane's two rows
   unsigned q_[S::kKeepsQ ? S::kSteps : 1][4] = {};
-  float scores_[S::kOwnKeys / 8][4], y_[S::kSums][S::kTiles][4] = {};
-  float most_[2] = {kMinusInfinity, kMinusInfinity}, total_[2] = {};
 };
 
 /// Warps divide a tile's keys among them, then the columns of the result. The next tile's keys are copied while values
