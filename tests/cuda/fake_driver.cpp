@@ -360,7 +360,9 @@ struct Calls {
         z == 0 || y > most || z > most || !are_known(attributes, n_attribute, cluster))
       return kInvalidValue;
     if (cluster == 0 || cluster > vla::cuda::kMaxCluster || z % cluster != 0) return kInvalidCluster;
-    if (cluster > 1) state.driver.in_clusters.insert(function->ptx ? function->ptx->name : function->entry->name);
+    const std::string name = function->ptx ? function->ptx->name : function->entry->name;
+    state.driver.launched.insert(name);
+    if (cluster > 1) state.driver.in_clusters.insert(name);
     const std::size_t size = function->ptx ? function->ptx->param_size : function->entry->job_size;
     if (!state.driver.computes) return enqueue(stream, [] {});
     const auto* from = static_cast<const std::byte*>(parameters[0]);

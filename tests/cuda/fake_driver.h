@@ -46,7 +46,7 @@ struct FakeDriver {
   std::vector<std::string> refused;   // symbols of calls that were answered with an error that nobody told it
   std::vector<std::string> images;    // what it was asked to load, its first 32 bytes
   std::string fault;                  // why a kernel failed
-  std::set<std::string> in_clusters;  // kernels that were launched in clusters of several blocks
+  std::set<std::string> launched, in_clusters;  // kernels; in_clusters: in clusters of several blocks
   std::size_t used = 0;
   long n_handle = 0;  // contexts, streams, events, modules, graphs and host memory that were not given back
 };

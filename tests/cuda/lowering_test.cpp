@@ -136,6 +136,21 @@ TEST_CASE("so they do where attention takes clusters, as it does on as many SMs 
   test::cuda::reset_fake_driver();
 }
 
+TEST_CASE("so they do where wgmma attends in prefixes, with VLA_CUDA_WITH=flash") {
+  const char* const which = std::getenv("VLA_ALL_FAMILIES") != nullptr ? "/one_view" : "/smolvla/one_view";
+  std::vector<std::string> paths = golden_paths();
+  std::erase_if(paths, [&](const std::string& path) { return !path.ends_with(which); });
+  REQUIRE(setenv("VLA_CUDA_WITH", "flash", 1) == 0);
+  for (const std::string& path : paths) {
+    test::cuda::reset_fake_driver();
+    check_nearer_than_bf16(path);
+    CHECK(std::ranges::any_of(test::cuda::fake_driver().launched,
+                              [](const std::string& kernel) { return kernel.starts_with("hopper_flash"); }));
+  }
+  REQUIRE(unsetenv("VLA_CUDA_WITH") == 0);
+  test::cuda::reset_fake_driver();
+}
+
 TEST_CASE("attention of few queries fills a device, and of many takes the keys one tile after the other") {
   const auto blocks = [](std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm) {
     const lower::AttentionPlan plan = lower::plan_attention(d_head, n_row, n_unit, n_key, n_sm, false);

@@ -22,6 +22,8 @@ struct FlashShape {
   int depth, rows, keys;  // depth: the largest d_head
   bool takes_mask = true;
 
+  /// Whether registers and shared memory of an SM hold two blocks.
+  constexpr bool shares_sm() const { return rows == 64 && depth < 256; }
   constexpr int n_thread() const { return rows * 2 + 32; }
   /// Columns of the depth in a swizzled row: as many as divide the depth.
   constexpr int columns() const { return depth % 64 == 0 ? 64 : 16; }

@@ -6,6 +6,7 @@
 #include <optional>
 
 #include "cuda/kernels/attention.h"
+#include "cuda/kernels/hopper_flash.h"
 #include "cuda/kernels/linear_bf16.h"
 #include "kernels/sizes.h"
 #include "lower/cuda/cuda_queue.h"
@@ -37,7 +38,8 @@ struct ProductCut {
 };
 /// How attention is cut into blocks of query rows and shares of the keys.
 struct AttentionPlan {
-  const cuda::AttentionShape* shape = nullptr;  // null: no tensor cores
+  const cuda::AttentionShape* shape = nullptr;  // null: no tensor cores, or `flash`
+  const cuda::FlashShape* flash = nullptr;      // of Hopper: by wgmma
   int n_split = 1;                              // shares of the keys, each with its own blocks
   bool in_cluster = false;                      // of Hopper: a cluster's blocks combine the shares
   double us = 0;                                // estimated time on Hopper, on tensor cores
@@ -147,6 +149,9 @@ double us_with_norm(const ProductCut& cut);
 /// whole batch.
 AttentionPlan plan_attention(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm,
                              bool has_clusters);
+/// The same by wgmma, over one segment of keys.
+AttentionPlan plan_flash(std::int64_t d_head, std::int64_t n_row, std::int64_t n_unit, std::int64_t n_key, int n_sm,
+                         bool has_mask);
 AttentionPlan plan_attention(const CudaLowering& l, const AttentionOp& op);
 
 /// FLOP and bytes, see Program::work.

@@ -18,7 +18,7 @@ constexpr Way kUsed[] = {{"clusters", &CudaWays::clusters},
                          {"adders", &CudaWays::adders},
                          {"halved-norms", &CudaWays::halved_norms},
                          {"rotations", &CudaWays::rotations}};
-constexpr Way kUnused[] = {{"tma", &CudaWays::tma}};
+constexpr Way kUnused[] = {{"flash", &CudaWays::flash}, {"tma", &CudaWays::tma}};
 
 /// Sets the ways that an environment variable names.
 Status set(const char* variable, std::span<const Way> known, bool is_used, CudaWays& ways) {

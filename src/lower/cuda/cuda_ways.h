@@ -15,6 +15,7 @@ struct CudaWays {
   bool adders = true;        // kernels of their own add the shares of products of up to 64 rows
   bool halved_norms = true;  // products begin and end norms
   bool rotations = true;     // products rotate heads
+  bool flash = false;        // wgmma multiplies what attention of one segment of keys does (hopper_flash.h)
   bool tma = false;          // TMA fetches the operands of products of more than 64 rows, where its tiles fit
 };
 

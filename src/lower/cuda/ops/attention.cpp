@@ -1,12 +1,26 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "cuda/kernels/attention.h"
+#include "cuda/kernels/hopper_flash.h"
 
 #include <cmath>
 
 #include "lower/cuda/emit.h"
 
 namespace vla::lower {
+
+namespace {
+
+/// Errors: device.
+Result<Call> flash_call(const CudaLowering& l, const cuda::FlashShape& shape, const cuda::AttentionJob& attention) {
+  cuda::FlashJob job = {.k = {}, .v = {}, .attention = attention};
+  if (l.gpu != nullptr) {
+    VLA_CHECK(l.gpu->map_heads(mapped_heads(shape, attention, attention.segment[0].k), job.k));
+    VLA_CHECK(l.gpu->map_heads(mapped_heads(shape, attention, attention.segment[0].v), job.v));
+  }
+  return call(cuda::hopper_flash(shape, attention), job);
+}
+
+}  // namespace
 
 Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const AttentionOp& attention) {
   const Value& q = l.value(attention.q.x);
@@ -30,7 +44,14 @@ Result<Calls> calls_of(const CudaLowering& l, const CudaOp& op, const AttentionO
   job.n_batch = narrow(q.shape[3]), job.n_head_kv = narrow(l.value(attention.packed[0]).shape[1]);
   job.n_split = op.plan.n_split, job.partial = l.at(op.partial),
   job.is_bf16 = l.value(op.writes[0]).type == DType::bf16;
-  Calls calls = {call(attention.rounds ? cuda::attention_bf16(*op.plan.shape, job) : cuda::attention_f32(job), job)};
+  Calls calls;
+  if (op.plan.flash != nullptr) {
+    VLA_TRY(Call made, flash_call(l, *op.plan.flash, job));
+    calls.push_back(std::move(made));
+  } else {
+    const bool rounds = attention.rounds;
+    calls.push_back(call(rounds ? cuda::attention_bf16(*op.plan.shape, job) : cuda::attention_f32(job), job));
+  }
   if (job.partial != nullptr) calls.push_back(call(cuda::finish_attention(job), job));
   return calls;
 }
