@@ -15,7 +15,7 @@ OUT/result.json is the result, OUT/log.txt all that was said. The stages, in ord
     cases      golden cases of every architecture: each value within 1e-4 of the reference in float32, chunks within PyTorch's own error in bf16
     families   acts of policies of their published sizes, with random weights, and what was predicted where there is a model of this GPU;
                each kernel of an act, where this Python has PyTorch
-    ways       the same acts without each of the ways to lower a graph that were chosen by estimates (VLA_CUDA_WITHOUT), and with TMA
+    ways       the same acts without each of the ways to lower a graph that were chosen by estimates (VLA_CUDA_WITHOUT), and with TMA or flash attention
     torch      LeRobot's own networks at the same sizes, where the Python of --torch has PyTorch and LeRobot
     products   matrix products and attention in all shapes of blocks, and cuBLAS where this Python has PyTorch
     cpu        the same acts on this machine's processor
@@ -39,7 +39,7 @@ VLA, TINY = KIT / "bin/vla", KIT / "tiny/policy.gguf"
 # Of the largest action: sums in another order; bf16 beside float32; codes, where what lies between products is rounded in other places.
 TOLERANCE = {"float32": 1e-4, "bf16": 3e-2, "int8": 1e-1, "int4": 1e-1}
 WAYS = {f"without {way}": {"VLA_CUDA_WITHOUT": way} for way in ("clusters", "adders", "halved-norms", "rotations")}  # in src/lower/cuda/cuda_ways.cpp
-WAYS["with tma"] = {"VLA_CUDA_WITH": "tma"}
+WAYS.update({f"with {way}": {"VLA_CUDA_WITH": way} for way in ("flash", "tma")})
 MODELS = {"H100": "h100", "H200": "h200", "5090": "rtx-5090", "3060": "rtx-3060", "Orin": "orin-agx"}  # in a card's name: vla bench --model
 
 

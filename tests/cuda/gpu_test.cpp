@@ -228,6 +228,20 @@ TEST_CASE("rows are mapped for a GPU as its driver takes them, or refused") {
     REQUIRE(!made.ok());
     CHECK(made.error().message().find("cuda tensor_map: CUDA_ERROR_INVALID_VALUE") != std::string::npos);
   }
+  const MappedHeads heads = {.data = rows,
+                             .d_head = 24,
+                             .n_head = 2,
+                             .n_token = 3,
+                             .n_batch = 2,
+                             .head = 24,
+                             .token = 72,
+                             .batch = 216,
+                             .box_columns = 16,
+                             .box_tokens = 128};
+  CHECK((*gpu)->map_heads(heads, map).ok());
+  MappedHeads narrow = heads, apart = heads, uneven = heads;
+  narrow.head = 16, apart.token = 80, uneven.d_head = 20, uneven.head = 20;
+  for (const MappedHeads& refused : {narrow, apart, uneven}) CHECK(!(*gpu)->map_heads(refused, map).ok());
 }
 
 TEST_CASE("capturing refuses what no graph can hold, and a stream that is not waited for") {

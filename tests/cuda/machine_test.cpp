@@ -32,7 +32,7 @@ bool contains(const std::string& text, const std::string& part) { return text.fi
 std::string kernel_of(const std::string& body) {
   return ".version 9.0\n.target sm_80\n.address_size 64\n.extern .shared .align 16 .b8 room[];\n"
          ".visible .entry k(\n.param .u64 k_param_0\n)\n{\n.reg .pred %p<4>;\n.reg .b32 %r<10>;\n.reg .f32 "
-         "%f<4>;\n.reg .b64 %rd<6>;\n"
+         "%f<8>;\n.reg .b64 %rd<6>;\n"
          "ld.param.u64 %rd1, [k_param_0];\nmov.u32 %r1, %tid.x;\nmul.wide.u32 %rd2, %r1, 4;\nadd.s64 %rd3, %rd1, "
          "%rd2;\n" +
          body + "\nret;\n}\n";
@@ -397,6 +397,64 @@ TEST_CASE("PTX: products of a warpgroup whose operands or sums are not ready, or
     CHECK(contains(fault(visible + barrier + "shl.b64 %rd4, %rd4, 1;\n" + fence + multiply + commit + wait),
                    "matrix descriptor"));
   });
+}
+
+TEST_CASE("PTX: products of a warpgroup with operand a in registers and a transposed b") {
+  // b[16][16] = k + 2 n, in rows of 32 bytes, of which thread t writes word t. Row r of a has a one at r % 16.
+  const std::string write_b =
+      "mov.u32 %r8, room;\nshr.u32 %r2, %r1, 3;\nand.b32 %r3, %r1, 7;\nshl.b32 %r3, %r3, 2;\nadd.s32 %r2, %r2, %r3;\n"
+      "cvt.rn.f32.s32 %f0, %r2;\nadd.s32 %r2, %r2, 2;\ncvt.rn.f32.s32 %f1, %r2;\ncvt.rn.bf16x2.f32 %r2, %f1, %f0;\n"
+      "shl.b32 %r3, %r1, 2;\nshr.u32 %r9, %r3, 7;\nand.b32 %r9, %r9, 1;\nshl.b32 %r9, %r9, 4;\n"
+      "xor.b32 %r3, %r3, %r9;\nadd.s32 %r3, %r3, %r8;\nst.shared.u32 [%r3], %r2;\nfence.proxy.async.shared::cta;\n"
+      "bar.sync 0;\n";
+  const std::string make_a =
+      "shr.u32 %r2, %r1, 2;\nand.b32 %r2, %r2, 7;\nand.b32 %r3, %r2, 1;\nshl.b32 %r3, %r3, 4;\nshr.u32 %r2, %r2, 1;\n"
+      "mov.u32 %r9, 16256;\nshl.b32 %r3, %r9, %r3;\nand.b32 %r9, %r1, 3;\nsetp.eq.s32 %p1, %r2, %r9;\n"
+      "selp.b32 %r4, %r3, 0, %p1;\nmov.u32 %r5, 0;\nmov.u32 %r6, 0;\nmov.u32 %r7, %r4;\n";
+  std::string begin = "cvt.u64.u32 %rd4, %r8;\nshr.u64 %rd4, %rd4, 4;\n";
+  for (int i = 0; i < 8; ++i) begin += "mov.f32 %f" + std::to_string(i) + ", 0f3f800000;\n";
+  const auto described = [](int swizzling, int stride) {
+    const std::uint64_t bits = static_cast<std::uint64_t>(swizzling) << 62 | static_cast<std::uint64_t>(stride) << 32;
+    return "or.b64 %rd4, %rd4, " + std::to_string(static_cast<std::int64_t>(bits)) + ";\n";
+  };
+  const auto multiply = [](const char* a, const char* tail) {
+    return std::string("wgmma.mma_async.sync.aligned.m64n16k16.f32.bf16.bf16 {%f0, %f1, %f2, %f3, %f4, %f5, %f6, %f7}, ") +
+           a + ", %rd4, %p2, " + tail + ";\n";
+  };
+  const std::string fence = "wgmma.fence.sync.aligned;\n", commit = "wgmma.commit_group.sync.aligned;\n",
+                    wait = "wgmma.wait_group.sync.aligned 0;\n", adds = "setp.eq.u32 %p2, 0, 0;\n",
+                    of_a = multiply("{%r4, %r5, %r6, %r7}", "1, 1, 1"), narrow = described(3, 16),
+                    store = "setp.lt.s32 %p3, %r1, 32;\n@%p3 st.global.f32 [%rd3], %f1;\n@%p3 st.global.f32 "
+                            "[%rd3+128], %f6;\n";
+  const std::string before = write_b + make_a + begin + adds;
+  std::vector<float> y;
+  const auto fault = [&](const std::string& body) {
+    return fault_of([&] {
+      const PtxModule module(kernel_of(before + body));
+      const Device<float> to(64);
+      float* p = to.get();
+      device_memory().begin_launch();
+      run_ptx(*module.find("k"), {1, 1, 1}, 128, 1 << 10, &p);
+      y = to.host();
+    });
+  };
+  in_every_schedule([&] {
+    CHECK(fault(narrow + fence + of_a + commit + wait + store).empty());
+    for (int l = 0; l < kWarp; ++l) {
+      const auto lane = static_cast<std::size_t>(l);
+      CHECK(y[lane] == static_cast<float>(1 + l / 4 + 2 * (l % 4 * 2 + 1)));
+      CHECK(y[32 + lane] == static_cast<float>(1 + l / 4 + 8 + 2 * (8 + l % 4 * 2)));
+    }
+    CHECK(contains(fault(narrow + fence + of_a + commit + "add.s32 %r4, %r4, 1;\n" + wait), "has not waited for"));
+    CHECK(contains(fault(narrow + fence + of_a + commit + "add.s32 %r9, %r7, 1;\n" + wait), "has not waited for"));
+    CHECK(contains(fault(narrow + fence + "add.s32 %r4, %r4, 1;\n" + of_a + commit + wait), "without wgmma.fence after"));
+    CHECK(contains(fault(narrow + "add.s64 %rd4, %rd4, 2;\n" + fence + of_a + commit + wait), "between eight rows"));
+    CHECK(contains(fault(described(1, 64) + fence + of_a + commit + wait), "a part of a row"));
+    CHECK(contains(fault(described(2, 32) + fence + of_a + commit + wait), "without swizzling over 128 or 32"));
+  });
+  CHECK(contains(fault(multiply("{%r4, %r5, %r6, %r7}", "1, 1, 0, 1")), "number of operands"));
+  CHECK(contains(fault(multiply("{%r4, %r5, %r6, %r7}", "1, -1, 1")), "negates"));
+  CHECK(contains(fault(multiply("%rd4", "1, 1, 1, 0")), "transposes a"));
 }
 
 TEST_CASE("bank conflicts are counted as lanes that wait") {

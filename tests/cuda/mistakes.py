@@ -419,6 +419,7 @@ TESTS = {
     "hopper_linear_int8": "*linear_int8_test*",
     "hopper_tma_bf16": "*hopper_tma_test*",
     "hopper_attention": "*/attention_test*",
+    "hopper_flash": "*hopper_flash_test*",
     "attention": "*/attention_test*",
     "attention_f32": "*/attention_test*",
     "rows": "*rows_test*",

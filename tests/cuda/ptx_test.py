@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What nvcc makes of the kernels: run as PTX, and assembled for every architecture."""
 
+import collections
 import os
 import re
 from concurrent.futures import ThreadPoolExecutor
@@ -100,6 +101,25 @@ def test_tiles_for_hopper_fit_it_and_their_products_do_not_wait_for_each_other(m
         assert tensor == {HOPPER_LOOP[kind].format(rows): 4}, name
 
 
+def test_attention_by_wgmma_fits_hopper_and_its_products_do_not_wait_for_each_other(machine_code):
+    """The assembler puts the loop around what comes before and behind it, which multiplies once more each."""
+    if not cuda_kernels.tool("nvdisasm"):
+        pytest.skip("no nvdisasm: it is beside the nvcc that `make test` downloads")
+    kernels = {name: code for (_, name), code in machine_code.items() if name.startswith("hopper_flash")}
+    header = (cuda_kernels.SOURCES / "cuda/kernels/hopper_flash.h").read_text()
+    shapes = {name: tuple(map(int, of.split(","))) for name, of in re.findall(r'\{"(hopper_flash_\w+)", (\d+, \d+, \d+)', header)}
+    assert kernels.keys() == shapes.keys() and kernels
+    for name, (used, loop) in kernels.items():
+        depth, rows, keys = shapes[name]
+        n_block = 2 if rows == 64 and depth < 256 else 1
+        n_warp = -(-n_block * (rows // 16 + 1) // 4)  # of a quarter of an SM, which has 16384 registers
+        assert n_warp * 32 * -(-used["registers"] // 8) * 8 <= 16384, name
+        expected = collections.Counter()
+        expected[f"HGMMA.64x{keys}x16.F32.BF16"] += 2 * depth // 16
+        expected[f"HGMMA.64x{depth}x16.F32.BF16"] += 2 * keys // 16
+        assert {op: n for op, n in loop.items() if op.startswith(cuda_kernels.TENSOR)} == expected, name
+
+
 def test_two_blocks_of_a_product_fit_the_registers_of_an_sm(machine_code):
     for (sm, name), (used, _) in machine_code.items():
         if name in TWO_BLOCKS:
@@ -111,7 +131,7 @@ def test_main_loops_have_the_tensor_instructions_that_they_need(machine_code):
         pytest.skip("no nvdisasm: it is beside the nvcc that `make test` downloads")
     for (sm, name), (_, loop) in machine_code.items():
         tensor = {op: n for op, n in loop.items() if op.startswith(cuda_kernels.TENSOR)}
-        if not name.startswith(HOPPER_PRODUCTS):
+        if not name.startswith((*HOPPER_PRODUCTS, "hopper_flash")):
             expected = MAIN_LOOPS.get(name.removeprefix("hopper_")) or STRIP_LOOPS.get(name)
             assert tensor == (dict([expected]) if expected else {}), (sm, name)
 

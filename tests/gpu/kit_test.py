@@ -52,7 +52,7 @@ def test_the_kit_tells_that_kernels_run_and_are_right_and_what_they_take(kit, tm
     assert found["cases"] == {"passed": 2, "failed": []}
     family = found["families"]["smolvla"]
     assert family["stored"]["ms"]["network"] > 0 and family["int8"]["ms"]["network"] > 0
-    assert all(family["ways"][way]["ms"]["network"] > 0 for way in ("without clusters", "without halved-norms", "with tma"))
+    assert all(family["ways"][way]["ms"]["network"] > 0 for way in ("without clusters", "without halved-norms", "with flash", "with tma"))
     assert family["predicted"]["model"] == "h100" and family["predicted"]["ms"]["steps"] > 0
     assert {row["kind"] for row in found["products"]} == {"bf16", "ternary", "int4", "int8"}
     assert {row["kernel"] for row in found["attention"]} >= {"attention_bf16_64", "attention_f32"}

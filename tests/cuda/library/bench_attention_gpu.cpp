@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Times attention of full-size policies in every shape of blocks and split of the keys on the first GPU, on Hopper also
-// in clusters, one JSON object a line: `us` of an attention with what combines its shares, `blocks_us` without a kernel
+// in clusters and by wgmma, one JSON object a line: `us` of an attention with what combines its shares, `blocks_us` without a kernel
 // that does. On the driver of tests the times say nothing.
 #include <fmt/format.h>
 
@@ -12,7 +12,7 @@
 #include <random>
 
 #include "base/bf16.h"
-#include "cuda/kernels/attention.h"
+#include "cuda/kernels/hopper_flash.h"
 #include "cuda/library/launch_timer.h"
 
 namespace {
@@ -88,16 +88,26 @@ class Bench {
     return run_shapes(size, job, n_key, sizeof(T) == 2);
   }
 
-  Status run_shapes(const Size& size, AttentionJob job, int n_key, bool is_bf16) {
+  /// The least depth of a table's shapes that heads fit.
+  template <class Shapes>
+  static int depth_of(const Shapes& shapes, const Size& size) {
     int depth = kMaxHead;
-    for (const AttentionShape& shape : kAttentionShapes)
+    for (const auto& shape : shapes)
       if (shape.depth >= size.d_head) depth = std::min(depth, shape.depth);
+    return depth;
+  }
+  Status run_shapes(const Size& size, AttentionJob job, int n_key, bool is_bf16) {
     for (const int n_split : kSplits) {
       if (n_split > 1 && n_key / n_split < 32) continue;
       job.n_split = n_split;
-      if (!is_bf16) VLA_CHECK(tell(size, job, attention_f32(job)));
+      if (!is_bf16) {
+        VLA_CHECK(tell(size, job, attention_f32(job)));
+        continue;
+      }
       for (const AttentionShape& shape : kAttentionShapes)
-        if (is_bf16 && shape.depth == depth) VLA_CHECK(run_shape(size, job, shape));
+        if (shape.depth == depth_of(kAttentionShapes, size)) VLA_CHECK(run_shape(size, job, shape));
+      for (const FlashShape& shape : kFlashShapes)
+        if (shape.depth == depth_of(kFlashShapes, size)) VLA_CHECK(run_flash(size, job, shape));
     }
     return {};
   }
@@ -108,12 +118,21 @@ class Bench {
     job.partial = nullptr;
     return tell(size, job, attention_bf16(shape, job));
   }
+  /// If the device, the segments and the mask are such as the shape takes.
+  Status run_flash(const Size& size, const AttentionJob& attention, const FlashShape& shape) {
+    if (!timer_.gpu().is_hopper() || attention.n_segment > 1 || (size.has_mask && !shape.takes_mask)) return {};
+    FlashJob job = {.k = {}, .v = {}, .attention = attention};
+    VLA_CHECK(timer_.gpu().map_heads(mapped_heads(shape, attention, attention.segment[0].k), job.k));
+    VLA_CHECK(timer_.gpu().map_heads(mapped_heads(shape, attention, attention.segment[0].v), job.v));
+    return tell(size, attention, hopper_flash(shape, attention), &job);
+  }
 
-  Status tell(const Size& size, const AttentionJob& job, const Launch& how) {
-    const Launch launches[] = {how, finish_attention(job)};
-    const std::span<const Launch> all(launches, job.n_split > 1 && job.partial != nullptr ? 2 : 1);
-    VLA_TRY(const float us, timer_.time(std::span(&job, 1), all));
-    VLA_TRY(const float of_blocks, timer_.time(std::span(&job, 1), all.first(1)));
+  Status tell(const Size& size, const AttentionJob& job, const Launch& how, const void* job_of_blocks = nullptr) {
+    const LaunchTimer::JobLaunch launches[] = {{how, job_of_blocks != nullptr ? job_of_blocks : &job},
+                                               {finish_attention(job), &job}};
+    const std::span<const LaunchTimer::JobLaunch> all(launches, job.n_split > 1 && job.partial != nullptr ? 2 : 1);
+    VLA_TRY(const float us, timer_.time(all));
+    VLA_TRY(const float of_blocks, timer_.time(all.first(1)));
     fmt::print(
         R"({{"attention": "{}", "kernel": "{}", "grid": [{}, {}, {}], "splits": {}, "us": {:.2f}, "blocks_us": {:.2f}}})"
         "\n",

@@ -45,14 +45,34 @@ class LaunchTimer {
   /// Microseconds of one launch of a graph of so many, whose jobs take turns: the median of several graphs' launches.
   template <class Job>
   Result<float> time(std::span<const Job> jobs, std::span<const vla::cuda::Launch> launches) {
-    VLA_TRY(const vla::cuda::Owned first, gpu_->event(true));
-    VLA_TRY(const vla::cuda::Owned last, gpu_->event(true));
     for (const vla::cuda::Launch& launch : launches) VLA_CHECK(gpu_->prepare(launch));
-    VLA_CHECK(stream_.begin_capture());
-    VLA_CHECK(stream_.note_time(first));
-    for (int i = 0; i < repeats_.n_launch; ++i)
+    return time_graph([&](int i) -> Status {
       for (const vla::cuda::Launch& launch : launches)
         VLA_CHECK(stream_.launch(launch, jobs[static_cast<std::size_t>(i) % jobs.size()]));
+      return {};
+    });
+  }
+  /// The same of launches with a job each.
+  struct JobLaunch {
+    vla::cuda::Launch how;
+    const void* job;
+  };
+  Result<float> time(std::span<const JobLaunch> launches) {
+    for (const JobLaunch& launch : launches) VLA_CHECK(gpu_->prepare(launch.how));
+    return time_graph([&](int) -> Status {
+      for (const JobLaunch& launch : launches) VLA_CHECK(stream_.launch_job(launch.how, launch.job));
+      return {};
+    });
+  }
+
+ private:
+  template <class LaunchAll>
+  Result<float> time_graph(LaunchAll launch_all) {
+    VLA_TRY(const vla::cuda::Owned first, gpu_->event(true));
+    VLA_TRY(const vla::cuda::Owned last, gpu_->event(true));
+    VLA_CHECK(stream_.begin_capture());
+    VLA_CHECK(stream_.note_time(first));
+    for (int i = 0; i < repeats_.n_launch; ++i) VLA_CHECK(launch_all(i));
     VLA_CHECK(stream_.note_time(last));
     VLA_TRY(const vla::cuda::Owned graph, stream_.end_capture());
     std::vector<float> times;
@@ -66,7 +86,6 @@ class LaunchTimer {
     return times[times.size() / 2];
   }
 
- private:
   LaunchTimer(std::unique_ptr<vla::cuda::Gpu> gpu, vla::cuda::Stream stream, Repeats repeats)
       : gpu_(std::move(gpu)), stream_(std::move(stream)), repeats_(repeats) {}
 
