@@ -13,15 +13,15 @@ namespace {
 // Towers (72 and 80 wide, a batch of views), grouped heads, a prefix of keys before the step's own, few queries with
 // keys split, the widest head, heads that no tile divides, and keys of several tiles in segments that end within them.
 const AttentionCase kCases[] = {{70, 2, 2, 2, 72, 1, {70}},
-                       {65, 4, 2, 1, 80, 1, {65}},
-                       {16, 8, 2, 1, 64, 1, {41, 16}, true},
-                       {50, 2, 1, 1, 128, 1, {130}},
-                       {5, 8, 1, 1, 256, 3, {100, 0, 5}, true},
-                       {1, 2, 2, 1, 24, 4, {33, 1}},
-                       {7, 6, 2, 2, 64, 1, {200, 0, 60, 70}, true},
-                       {11, 6, 2, 1, 40, 2, {90, 41}},
-                       {9, 4, 1, 2, 128, 2, {70, 210}, true},
-                       {4, 10, 1, 1, 256, 1, {70, 63}, true}};
+                                {65, 4, 2, 1, 80, 1, {65}},
+                                {16, 8, 2, 1, 64, 1, {41, 16}, true},
+                                {50, 2, 1, 1, 128, 1, {130}},
+                                {5, 8, 1, 1, 256, 3, {100, 0, 5}, true},
+                                {1, 2, 2, 1, 24, 4, {33, 1}},
+                                {7, 6, 2, 2, 64, 1, {200, 0, 60, 70}, true},
+                                {11, 6, 2, 1, 40, 2, {90, 41}},
+                                {9, 4, 1, 2, 128, 2, {70, 210}, true},
+                                {4, 10, 1, 1, 256, 1, {70, 63}, true}};
 // For every depth of a cluster's kernels: shares without keys, shares of which some rows see nothing, rows that fill no
 // tile or end in one, heads that are less than the depth, and clusters of as many blocks as there may be.
 const AttentionCase kClusterCases[] = {

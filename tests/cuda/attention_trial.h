@@ -77,7 +77,8 @@ class AttentionTrial {
   }
   template <class Start>
   std::vector<float> run_f32(Start start) const {
-    return run<float>(start, false, [](const std::vector<float>& of, int) { return of; }, 0, false);
+    return run<float>(
+        start, false, [](const std::vector<float>& of, int) { return of; }, 0, false);
   }
 
   AttentionCase c;

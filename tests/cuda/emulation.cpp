@@ -44,7 +44,7 @@ struct Warp {
   int n_here = 0;
   Meeting::Kind kind = Meeting::kSync;  // what the lanes that are here came to
   Wgmma wgmma = {};
-  std::list<Sums> sums = {};           // in flight
+  std::list<Sums> sums = {};          // in flight
   std::list<OperandA> operands = {};  // likewise
 };
 /// A block of the cluster that runs.

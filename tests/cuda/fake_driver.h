@@ -41,11 +41,11 @@ struct FakeDriver {
   std::map<std::string, long> n_call;  // by symbol
   long n_calls = 0;
   bool logs = false;
-  std::vector<std::string> log;       // of symbols, where it logs
-  std::string failed_call;            // the first that was told to fail
-  std::vector<std::string> refused;   // symbols of calls that were answered with an error that nobody told it
-  std::vector<std::string> images;    // what it was asked to load, its first 32 bytes
-  std::string fault;                  // why a kernel failed
+  std::vector<std::string> log;                 // of symbols, where it logs
+  std::string failed_call;                      // the first that was told to fail
+  std::vector<std::string> refused;             // symbols of calls that were answered with an error that nobody told it
+  std::vector<std::string> images;              // what it was asked to load, its first 32 bytes
+  std::string fault;                            // why a kernel failed
   std::set<std::string> launched, in_clusters;  // kernels; in_clusters: in clusters of several blocks
   std::size_t used = 0;
   long n_handle = 0;  // contexts, streams, events, modules, graphs and host memory that were not given back

@@ -46,7 +46,7 @@ TEST_CASE("with VLA_CUDA_WITH=flash wgmma attends over one segment of keys, wher
   } cases[] = {{{64, 6, 2, 100, 1, {150}, true}, "hopper_flash_64x"},
                {{72, 2, 2, 130, 2, {130}}, "hopper_flash_80x"},
                {{256, 4, 1, 80, 1, {80}}, "hopper_flash_256x"},
-               {{64, 2, 2, 100, 1, {70, 60}}, "attention_bf16_64"},  // segments
+               {{64, 2, 2, 100, 1, {70, 60}}, "attention_bf16_64"},      // segments
                {{72, 2, 2, 130, 1, {130}, true}, "hopper_flash_128x"}};  // with a mask in wider blocks
   for (const auto& [of, kernel] : cases) {
     const auto [expected, plain] = run(of, "ggml");

@@ -12,10 +12,10 @@ using namespace vla::test::cuda;
 
 namespace {
 
-// For every depth: less than a block of rows and more, grouped heads whose rows no block divides, fewer keys than a tile
-// has, more than there is room for, and tiles that end in one; a batch; heads that are less than the depth, of which TMA
-// must not read the neighbours; tiles, at the beginning or the end, of which some rows see nothing; shares of the keys,
-// also without keys.
+// For every depth: less than a block of rows and more, grouped heads whose rows no block divides, fewer keys than a
+// tile has, more than there is room for, and tiles that end in one; a batch; heads that are less than the depth, of
+// which TMA must not read the neighbours; tiles, at the beginning or the end, of which some rows see nothing; shares of
+// the keys, also without keys.
 const AttentionCase kFlashCases[] = {{70, 2, 2, 2, 64, 1, {300}},
                                      {47, 6, 2, 1, 48, 1, {130}, true, -128},
                                      {25, 3, 1, 1, 40, 4, {150}, true, 60},
@@ -50,9 +50,8 @@ TEST_CASE("attention by wgmma is within a rounding of its weights of doubles in 
       const std::vector<double> expected = trial.expected();
       INFO(shape.kernel, ": ", c.n_query, " queries, heads of ", c.d_head);
       const auto start = [&](const AttentionJob& job) { launch_flash(shape, job); };
-      in_two_schedules(static_cast<std::size_t>((&c - kFlashCases) + (&shape - kFlashShapes)), [&] {
-        CHECK(error(trial.run_bf16(start, false), expected) < 4e-3);
-      });
+      in_two_schedules(static_cast<std::size_t>((&c - kFlashCases) + (&shape - kFlashShapes)),
+                       [&] { CHECK(error(trial.run_bf16(start, false), expected) < 4e-3); });
       CHECK(error(trial.run_bf16(start, true), expected) < 8e-3);
       ++n_run;
     }

@@ -418,14 +418,16 @@ TEST_CASE("PTX: products of a warpgroup with operand a in registers and a transp
     return "or.b64 %rd4, %rd4, " + std::to_string(static_cast<std::int64_t>(bits)) + ";\n";
   };
   const auto multiply = [](const char* a, const char* tail) {
-    return std::string("wgmma.mma_async.sync.aligned.m64n16k16.f32.bf16.bf16 {%f0, %f1, %f2, %f3, %f4, %f5, %f6, %f7}, ") +
+    return std::string(
+               "wgmma.mma_async.sync.aligned.m64n16k16.f32.bf16.bf16 {%f0, %f1, %f2, %f3, %f4, %f5, %f6, %f7}, ") +
            a + ", %rd4, %p2, " + tail + ";\n";
   };
   const std::string fence = "wgmma.fence.sync.aligned;\n", commit = "wgmma.commit_group.sync.aligned;\n",
                     wait = "wgmma.wait_group.sync.aligned 0;\n", adds = "setp.eq.u32 %p2, 0, 0;\n",
                     of_a = multiply("{%r4, %r5, %r6, %r7}", "1, 1, 1"), narrow = described(3, 16),
-                    store = "setp.lt.s32 %p3, %r1, 32;\n@%p3 st.global.f32 [%rd3], %f1;\n@%p3 st.global.f32 "
-                            "[%rd3+128], %f6;\n";
+                    store =
+                        "setp.lt.s32 %p3, %r1, 32;\n@%p3 st.global.f32 [%rd3], %f1;\n@%p3 st.global.f32 "
+                        "[%rd3+128], %f6;\n";
   const std::string before = write_b + make_a + begin + adds;
   std::vector<float> y;
   const auto fault = [&](const std::string& body) {
@@ -447,7 +449,8 @@ TEST_CASE("PTX: products of a warpgroup with operand a in registers and a transp
     }
     CHECK(contains(fault(narrow + fence + of_a + commit + "add.s32 %r4, %r4, 1;\n" + wait), "has not waited for"));
     CHECK(contains(fault(narrow + fence + of_a + commit + "add.s32 %r9, %r7, 1;\n" + wait), "has not waited for"));
-    CHECK(contains(fault(narrow + fence + "add.s32 %r4, %r4, 1;\n" + of_a + commit + wait), "without wgmma.fence after"));
+    CHECK(
+        contains(fault(narrow + fence + "add.s32 %r4, %r4, 1;\n" + of_a + commit + wait), "without wgmma.fence after"));
     CHECK(contains(fault(narrow + "add.s64 %rd4, %rd4, 2;\n" + fence + of_a + commit + wait), "between eight rows"));
     CHECK(contains(fault(described(1, 64) + fence + of_a + commit + wait), "a part of a row"));
     CHECK(contains(fault(described(2, 32) + fence + of_a + commit + wait), "without swizzling over 128 or 32"));

@@ -35,9 +35,9 @@ struct PtxInstruction {
   bool sign = false, wide_address = false, wide_value = false;  // registers of 8 bytes
   mutable DeviceMemory::Allocation* hint = nullptr;             // where the last access went
   mutable std::uint64_t hint_time = 0;
-  std::vector<std::uint32_t> sums;   // of wgmma
-  std::vector<std::uint32_t> of_a;   // of wgmma whose operand a is in registers
-  bool makes_operand = false;        // writes such a register
+  std::vector<std::uint32_t> sums;  // of wgmma
+  std::vector<std::uint32_t> of_a;  // of wgmma whose operand a is in registers
+  bool makes_operand = false;       // writes such a register
   WgmmaProduct product;
   bool is_move = false;
   std::string text;

@@ -259,8 +259,7 @@ void run_box_copy(WarpState& w, const PtxInstruction& i) {
         throw Fault("does not wait for earlier kernels");
       return reinterpret_cast<const std::byte*>(from);
     };
-    const std::vector<std::byte> box =
-        copy_box(w.job + map, std::span(place, static_cast<std::size_t>(n)), to, read);
+    const std::vector<std::byte> box = copy_box(w.job + map, std::span(place, static_cast<std::size_t>(n)), to, read);
     if (!kHasMask) return w.shared->bulk_copy(to, box, mbarrier, *w.shared, w.thread(l));
     const u32 blocks = w.lanes<u32>(i.operand[3 + n])[l] & 0xffff;
     for (std::size_t rank = 0; blocks >> rank != 0; ++rank) {

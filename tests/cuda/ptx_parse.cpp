@@ -248,8 +248,8 @@ class Reader {
     }
   }
 
-  /// Sums, a's descriptor or four registers, b's descriptor, whether it adds; of floats also that nothing is negated, and
-  /// whether a and b are transposed, which a in registers cannot be.
+  /// Sums, a's descriptor or four registers, b's descriptor, whether it adds; of floats also that nothing is negated,
+  /// and whether a and b are transposed, which a in registers cannot be.
   void decode_wgmma(PtxInstruction& one, const std::string& name, const std::vector<std::string>& operands) {
     one.run = find_wgmma(name, one.product), one.kind = PtxInstruction::kWarp;
     if (one.run == nullptr) throw Fault("unknown instruction " + name);

@@ -53,8 +53,7 @@ std::vector<std::byte> copy_box(const void* map, std::span<const int> first, std
     if (from == 0) continue;
     const std::size_t plain = to + i, swizzled = plain ^ (plain >> 7 & (row / kChunk - 1)) * kChunk;
     // Sixteen bytes where they are one piece of a row.
-    const bool whole =
-        from % kChunk == 0 && i % kChunk == 0 && place[0] + 7 < static_cast<std::int64_t>(of.size[0]);
+    const bool whole = from % kChunk == 0 && i % kChunk == 0 && place[0] + 7 < static_cast<std::int64_t>(of.size[0]);
     const std::size_t n = whole ? kChunk : kElement;
     std::memcpy(&box[swizzled - to], read(static_cast<std::uintptr_t>(from), n), n);
     if (whole) i += kChunk - kElement;

@@ -56,7 +56,8 @@ TEST_CASE("with VLA_CUDA_WITH=tma TMA fetches what products of many rows multipl
   REQUIRE(name.ok());
   CHECK((*name)->name() == "cuda:0, a GPU of tests, with tma");
   REQUIRE(!unknown.ok());
-  CHECK(unknown.error().message() == "VLA_CUDA_WITH: expected names of flash, tma, with commas between them, found TMA");
+  CHECK(unknown.error().message() ==
+        "VLA_CUDA_WITH: expected names of flash, tma, with commas between them, found TMA");
 }
 
 }  // namespace tma_lowering_test

@@ -15,9 +15,10 @@ namespace {
 constexpr std::size_t kChunk = 16;       // bytes that swizzling moves together
 constexpr std::size_t kDepthBytes = 32;  // of a product
 
-/// An operand in shared memory, as its matrix descriptor says: rows of 128 or 32 bytes, which are swizzled. A transposed
-/// one has a row for each element of the depth. Source: PTX ISA 9.0, "Strides"; the canonical layouts in CUTLASS,
-/// include/cute/atom/mma_traits_sm90_gmma.hpp, and include/types/shared/descriptor.cuh of ThunderKittens say the same.
+/// An operand in shared memory, as its matrix descriptor says: rows of 128 or 32 bytes, which are swizzled. A
+/// transposed one has a row for each element of the depth. Source: PTX ISA 9.0, "Strides"; the canonical layouts in
+/// CUTLASS, include/cute/atom/mma_traits_sm90_gmma.hpp, and include/types/shared/descriptor.cuh of ThunderKittens say
+/// the same.
 class Operand {
  public:
   explicit Operand(std::uint64_t descriptor, bool transposed = false, int n = 0)

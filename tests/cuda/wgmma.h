@@ -19,8 +19,8 @@ struct WgmmaRegisters {
 };
 
 /// The products of a warp, which has 16 of its warpgroup's 64 rows. Operands are read when a product is issued or as
-/// late as it is waited for, as schedule.late_copies says; both are a GPU's. Until then its registers are nobody's to touch.
-/// Source: PTX ISA 9.0, "Asynchronous Warpgroup Level Matrix Multiply-Accumulate Instructions".
+/// late as it is waited for, as schedule.late_copies says; both are a GPU's. Until then its registers are nobody's to
+/// touch. Source: PTX ISA 9.0, "Asynchronous Warpgroup Level Matrix Multiply-Accumulate Instructions".
 class Wgmma {
  public:
   void begin(SharedMemory& shared, int warp);

@@ -110,10 +110,9 @@ Status encode_map(const Driver& driver, const void* data, const std::int64_t (&s
     size[i] = static_cast<std::uint64_t>(sizes[i]), box_size[i] = static_cast<unsigned>(box[i]), steps[i] = 1;
     if (i > 0) stride[i - 1] = static_cast<std::uint64_t>(strides[i - 1]) * sizeof(std::uint16_t);
   }
-  return check_call(
-      driver, "tensor_map",
-      driver.tensor_map(&map, kBf16, kDimensions, const_cast<void*>(data), size, stride, box_size, steps, kNoInterleave,
-                        box[0] == 16 ? kSwizzle32 : kSwizzle128, kPromote256, kZeros));
+  return check_call(driver, "tensor_map",
+                    driver.tensor_map(&map, kBf16, kDimensions, const_cast<void*>(data), size, stride, box_size, steps,
+                                      kNoInterleave, box[0] == 16 ? kSwizzle32 : kSwizzle128, kPromote256, kZeros));
 }
 
 }  // namespace

@@ -205,8 +205,8 @@ VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t 
   VLA_WGMMA_OF_ANY_SIZE("k16.f32.bf16.bf16", ", 1, 1, 0, 0", "+f");
 }
 
-/// sum[64, kN] += a[64, 16] * b[16, kN] of bf16. a is in registers, which nobody may touch before the product was waited
-/// for: in each warp those of operand a of dev::multiply_bf16. b is a descriptor of shared memory, see
+/// sum[64, kN] += a[64, 16] * b[16, kN] of bf16. a is in registers, which nobody may touch before the product was
+/// waited for: in each warp those of operand a of dev::multiply_bf16. b is a descriptor of shared memory, see
 /// transposed_descriptor.
 template <int kN>
 VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], const unsigned (&a)[4], std::uint64_t b) {
@@ -230,9 +230,9 @@ VLA_DEVICE void wgmma_s8(int (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, b
 
 namespace vla::cuda {
 
-/// Operands of wgmma are rows of kRow bytes, 128 or 32: of the depth, or of b's columns where b is transposed. Eight rows
-/// follow each other and are aligned to their size. The 16-byte chunks of rows are permuted by the rows' addresses:
-/// swizzling over kRow bytes. Source: PTX ISA 9.0, "Strides", "Matrix descriptor format".
+/// Operands of wgmma are rows of kRow bytes, 128 or 32: of the depth, or of b's columns where b is transposed. Eight
+/// rows follow each other and are aligned to their size. The 16-byte chunks of rows are permuted by the rows'
+/// addresses: swizzling over kRow bytes. Source: PTX ISA 9.0, "Strides", "Matrix descriptor format".
 constexpr int kSwizzledRow = 128, kSwizzledRows = 8;
 template <int kRow = kSwizzledRow>
 VLA_DEVICE int swizzled(int row, int chunk) {
@@ -250,7 +250,8 @@ VLA_DEVICE std::uint64_t swizzled_descriptor(const std::byte* rows) {
 /// are in rows that lie `next` bytes on. To advance by 16 of the depth, add kRow.
 template <int kRow>
 VLA_DEVICE std::uint64_t transposed_descriptor(const std::byte* rows, int next) {
-  return (swizzled_descriptor<kRow>(rows) & ~(std::uint64_t{0x3fff} << 16)) | static_cast<std::uint64_t>(next / 16) << 16;
+  return (swizzled_descriptor<kRow>(rows) & ~(std::uint64_t{0x3fff} << 16)) | static_cast<std::uint64_t>(next / 16)
+                                                                                  << 16;
 }
 
 }  // namespace vla::cuda

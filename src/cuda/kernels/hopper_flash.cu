@@ -23,8 +23,8 @@ struct FlashBlock {
   static_assert(kOf.shared() <= static_cast<int>(kHopperShared) && kKeys % 16 == 0 && kTile % 1024 == 0);
 };
 
-/// Tiles of keys and values, numbered in the order in which they are fetched and multiplied, take turns in shared memory.
-/// A place's `full` ends a phase when a tile is there, its `empty` when all warps that multiply have read it.
+/// Tiles of keys and values, numbered in the order in which they are fetched and multiplied, take turns in shared
+/// memory. A place's `full` ends a phase when a tile is there, its `empty` when all warps that multiply have read it.
 template <class S>
 struct Tiles {
   std::byte* first;
@@ -204,7 +204,7 @@ class FlashWarp : AttentionWarp<S> {
   }
 
   const KeyShare& share_;
-  std::uint64_t q_;         // descriptor of the warpgroup's queries
+  std::uint64_t q_;  // descriptor of the warpgroup's queries
   Tiles<S> tiles_;
   unsigned next_ = 0;  // the next tile to multiply
   unsigned weights_[S::kKeys / 16][4];
@@ -229,7 +229,7 @@ VLA_DEVICE void attend(const FlashJob& job) {
     const int n_tile = (share.last - share.first + S::kKeys - 1) / S::kKeys;
     Fetch<S> fetch(job, unit, share, tiles);
     if (is_first) fetch.run(0, n_tile < 1 ? 1 : 2, n_tile);  // waits for nobody
-    __syncthreads();  // queries are there
+    __syncthreads();                                         // queries are there
     if (is_first) fetch.run(2, n_tile + 1, n_tile);
   }
 }

@@ -12,8 +12,8 @@ struct alignas(64) TensorMap {
   std::uint64_t opaque[16];
 };
 
-/// Heads of bf16 in device memory: d_head elements of each head, token and batch, with strides in elements: multiples of
-/// 8, each of the one before.
+/// Heads of bf16 in device memory: d_head elements of each head, token and batch, with strides in elements: multiples
+/// of 8, each of the one before.
 struct MappedHeads {
   const void* data;
   int d_head, n_head, n_token, n_batch;

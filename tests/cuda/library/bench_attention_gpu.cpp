@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Times attention of full-size policies in every shape of blocks and split of the keys on the first GPU, on Hopper also
-// in clusters and by wgmma, one JSON object a line: `us` of an attention with what combines its shares, `blocks_us` without a kernel
-// that does. On the driver of tests the times say nothing.
+// in clusters and by wgmma, one JSON object a line: `us` of an attention with what combines its shares, `blocks_us`
+// without a kernel that does. On the driver of tests the times say nothing.
 #include <fmt/format.h>
 
 #include <cmath>
