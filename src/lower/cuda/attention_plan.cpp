@@ -23,9 +23,8 @@ constexpr double kStart = 2.9, kCombine = 2.7;
 /// Bytes of partial sums that one SM moves per microsecond.
 constexpr double kPartial = 12.4e3;
 
-/// Rates of attention by wgmma, which nobody has measured. Products: a half of what an H200 multiplies at most, which
-/// is less than is published of FlashAttention-3 on an H100 (Shah et al. 2024: 0.45 to 0.65 of the peak at heads of 64
-/// to 256, over many keys). Two blocks of 64 rows share an SM.
+/// Rates of attention by wgmma, which nobody has measured. Products: an assumption, a half of what an H200 multiplies
+/// at most. Two blocks of 64 rows share an SM.
 constexpr AttentionRates kFlash = {.tile = 0.3, .products = 1.9e6, .further = 0.6};
 
 /// What attention computes, as plan_attention is told it.
