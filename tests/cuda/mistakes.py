@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mistakes that mistakes_test.py makes in kernels, and the tests that must see them."""
 
+from hopper_attention_mistakes import HOPPER_ATTENTION_MISTAKES
 from hopper_mistakes import HOPPER_MISTAKES
 
 # File with the mistake, kernel to compile, what is there, what is there instead.
@@ -365,7 +366,7 @@ MISTAKES = {
     "NaN is not the largest": ("window.cu", "window", "x > most || x != x", "x > most"),
     "an image too far": ("window.cu", "window", "view * job.height * job.width", "view * job.height * job.height"),
 }
-MISTAKES |= HOPPER_MISTAKES
+MISTAKES |= HOPPER_MISTAKES | HOPPER_ATTENTION_MISTAKES
 MISTAKES |= {
     # Strips of few rows.
     "sums are added before all warps have theirs": ("linear_strip.cu", "linear_strip", "  __syncthreads();  // sums of all warps are there\n", ""),
