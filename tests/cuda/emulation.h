@@ -204,8 +204,8 @@ void wgmma_bf16(float (&sum)[kN / 2], const unsigned (&a)[4], std::uint64_t b) {
   wgmma({test::cuda::WgmmaProduct::bf16, kN, 0, b, true, true, true}, sum, a);
 }
 template <int kN>
-void wgmma_s8(int (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
-  wgmma({test::cuda::WgmmaProduct::s8, kN, a, b, adds}, sum);
+void wgmma_s8(int (&sum)[kN / 2], const unsigned (&a)[4], std::uint64_t b, bool adds) {
+  wgmma({test::cuda::WgmmaProduct::s8, kN, 0, b, adds, true}, sum, a);
 }
 inline void wgmma_fence() {
   test::cuda::Meeting mine = {test::cuda::Meeting::kWgmmaFence};

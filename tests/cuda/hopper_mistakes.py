@@ -211,35 +211,77 @@ HOPPER_MISTAKES = {
         "dev::wait_copies<T::kStages - 3>();",
         "dev::wait_copies<T::kStages - 2>();",
     ),
-    "codes are unpacked to rows that wgmma reads": (
+    "codes are unpacked to registers that wgmma reads": (
         "hopper_linear_int8.cu",
         "hopper_linear_int8",
-        "if (i + 1 < n) codes.unpack(packed + stage * kPacked, rows_w + stage_w * T::kBytesW);",
-        "if (i + 1 < n) codes.unpack(packed + stage * kPacked, rows_w + (stage_w + 2) % 3 * T::kBytesW);",
+        "    dev::wgmma_wait<1>();  // the second half may be unpacked\n",
+        "",
+    ),
+    "codes of the next step are unpacked to registers that wgmma reads": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "    dev::wgmma_wait<1>();\n    if (i + 1 < n)",
+        "    if (i + 1 < n)",
+    ),
+    "no fence between codes in registers and wgmma": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "      dev::wgmma_fence();\n",
+        "",
     ),
     "the first codes are read too early": (
         "hopper_linear_int8.cu",
         "hopper_linear_int8",
-        "  dev::wait_copies<T::kStages - 2>();\n  codes.unpack",
-        "  codes.unpack",
+        "  dev::wait_copies<T::kStages - 2>();\n  __syncthreads();  // the first codes are there",
+        "  __syncthreads();",
     ),
-    "no fence before wgmma reads unpacked codes": (
+    "the first codes are read before other warps copied them": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "  __syncthreads();  // the first codes are there\n",
+        "",
+    ),
+    "no fence before wgmma reads rows of codes": (
         "hopper_linear_int8.cu",
         "hopper_linear_int8",
         "    dev::fence_async_proxy();\n",
         "",
     ),
-    "unpacked codes are not swizzled": (
+    "a warp multiplies the columns of its neighbour": (
         "hopper_linear_int8.cu",
         "hopper_linear_int8",
-        "swizzled(column, warp() % 2 * 4 + fragment)",
-        "column * kSwizzledRow + (warp() % 2 * 4 + fragment) * 16",
+        "0U - static_cast<unsigned>(warp() % 2)",
+        "0U - static_cast<unsigned>(1 - warp() % 2)",
     ),
-    "fragments of unpacked codes swapped": (
+    "ternary fragments swapped": (
         "hopper_linear_int8.cu",
         "hopper_linear_int8",
-        "codes.fragment(eight, i)",
-        "codes.fragment(eight, i ^ 1)",
+        "ternary_fragment(of[i % 2], i / 2)",
+        "ternary_fragment(of[i % 2], i / 2 ^ 1)",
+    ),
+    "fragments of int8 codes swapped": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "to[0][2 + e] = of.y, to[1][e] = of.z",
+        "to[0][2 + e] = of.z, to[1][e] = of.y",
+    ),
+    "the second half of the next step's codes": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "codes.unpack(packed + before * T::kPacked, 1",
+        "codes.unpack(packed + stage * T::kPacked, 1",
+    ),
+    "terms of the first block's rows": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "RowOfCodes(job, row0 + row)",
+        "RowOfCodes(job, row)",
+    ),
+    "terms of rows lie where sums do": (
+        "hopper_linear_int8.cu",
+        "hopper_linear_int8",
+        "*terms = shared + T::kTerms;",
+        "*terms = shared;",
     ),
     "codes of a tile behind the last": (
         "hopper_linear_int8.cu",
@@ -250,8 +292,8 @@ HOPPER_MISTAKES = {
     "each share of the depth takes the offset off": (
         "hopper_linear_int8.cu",
         "hopper_linear_int8",
-        "T::kKind == CodeKind::ternary && z == 0 ?",
-        "T::kKind == CodeKind::ternary ?",
+        "T::kKind == CodeKind::ternary && z == 0;",
+        "T::kKind == CodeKind::ternary;",
     ),
     "a cluster takes the offset off for each share": (
         "hopper_linear_int8.cu",

@@ -47,8 +47,8 @@ MISTAKES = {
     "fragments of codes swapped": (
         "packed_codes.h",
         "linear_int8",
-        "words_[eight] >> 2 * i &",
-        "words_[eight] >> 2 * (i ^ 1) &",
+        "ternary_fragment(words_[eight], i)",
+        "ternary_fragment(words_[eight], i ^ 1)",
     ),
     "halves of bytes swapped": (
         "packed_codes.h",
@@ -120,7 +120,7 @@ MISTAKES = {
     "no division near the ends of the exponents": (
         "row_scale.h",
         "hopper_linear_int8",
-        "if (are_plain && is_plain(row_scale.s)) return;",
+        "if (are_plain && row.is_plain) return;",
         "return;",
     ),
     "a split too short": (

@@ -255,7 +255,7 @@ class Reader {
     if (one.run == nullptr) throw Fault("unknown instruction " + name);
     const auto n_sum = static_cast<std::size_t>(one.product.n / 2);
     const bool is_bf16 = one.product.kind == WgmmaProduct::bf16;
-    one.product.a_in_registers = is_bf16 && operands.size() == n_sum + 9;
+    one.product.a_in_registers = operands.size() == n_sum + (is_bf16 ? 9 : 6);
     std::vector<std::string> tail = {"1", "1", "0"};
     if (!is_bf16 || one.product.a_in_registers) tail.resize(is_bf16 ? 2 : 0);
     const std::size_t n_of_a = one.product.a_in_registers ? 4 : 1, first = n_sum + n_of_a + 2;

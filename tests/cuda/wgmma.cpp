@@ -50,10 +50,12 @@ class Operand {
   bool is_transposed_;
 };
 
-/// Number k of a row of operand a in registers, as mma_bf16 takes it (fragments.h).
-float of_register(const WgmmaRegisters& a, int row, int k) {
-  const auto lane = static_cast<std::size_t>(row % 8 * 4 + k % 8 / 2);
-  return bf16_to_float(a.of[static_cast<std::size_t>(row / 8 + k / 8 * 2)][lane] >> k % 2 * 16 & 0xffff);
+/// The bytes of a row of operand a in registers, as mma_bf16 and mma_s8 take it (fragments.h).
+void row_of_registers(const WgmmaRegisters& a, int row, std::uint8_t (&to)[kDepthBytes]) {
+  for (std::size_t at = 0; at < kDepthBytes; at += 4) {
+    const auto r = static_cast<std::size_t>(row);
+    std::memcpy(to + at, &a.of[r / 8 + at / 16 * 2][r % 8 * 4 + at % 16 / 4], 4);
+  }
 }
 
 }  // namespace
@@ -110,15 +112,18 @@ template <int kDepth>
 void Wgmma::compute(const Product& product) const {
   constexpr bool kIsBf16 = kDepth == 16;
   using Eight [[gnu::vector_size(32)]] = float;  // one number of each of eight rows
-  const auto load = [&](const Operand& from, int row, float(&to)[kDepth]) {
-    std::uint8_t bytes[kDepthBytes];
-    for (int which = 0; which < 2; ++which)
-      std::memcpy(bytes + which * 16, shared_->data() + from.chunk(row, which), kChunk);
+  const auto numbers = [](const std::uint8_t(&bytes)[kDepthBytes], float(&to)[kDepth]) {
     for (int k = 0; k < kDepth; ++k) {
       std::uint16_t half = 0;
       if (kIsBf16) std::memcpy(&half, bytes + 2 * k, 2);
       to[k] = kIsBf16 ? bf16_to_float(half) : static_cast<float>(static_cast<std::int8_t>(bytes[k]));
     }
+  };
+  std::uint8_t bytes[kDepthBytes];
+  const auto load = [&](const Operand& from, int row, float(&to)[kDepth]) {
+    for (int which = 0; which < 2; ++which)
+      std::memcpy(bytes + which * 16, shared_->data() + from.chunk(row, which), kChunk);
+    numbers(bytes, to);
   };
   const auto load_column = [&](const Operand& from, int column, float(&to)[kDepth]) {
     for (int k = 0; k < kDepth; ++k) {
@@ -131,7 +136,7 @@ void Wgmma::compute(const Product& product) const {
   float one[kDepth];
   for (int row = 0; row < 16; ++row) {
     if (product.a_in_registers)
-      for (int k = 0; k < kDepth; ++k) one[k] = of_register(*product.in_registers, row, k);
+      row_of_registers(*product.in_registers, row, bytes), numbers(bytes, one);
     else
       load(Operand(product.a), warp_ % 4 * 16 + row, one);
     for (int k = 0; k < kDepth; ++k) rows[k][row / 8][row % 8] = one[k];

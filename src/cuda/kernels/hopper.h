@@ -164,36 +164,34 @@ VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
 #define VLA_S112(c) VLA_S104(c), VLA_SUMS(c, 104)
 #define VLA_S120(c) VLA_S112(c), VLA_SUMS(c, 112)
 #define VLA_S128(c) VLA_S120(c), VLA_SUMS(c, 120)
-// half: n / 2, the number of a thread's sums and of operand a, which follows them; pb, pp: numbers of operands b, adds.
-#define VLA_WGMMA(n, half, pb, pp, shape, tail, c)                                                     \
-  if constexpr (kN == n)                                                                               \
-    asm volatile("{\n.reg .pred adds;\nsetp.ne.b32 adds, %" #pp ", 0;\n"                               \
-                 "wgmma.mma_async.sync.aligned.m64n" #n shape " {" VLA_R##half "}, %" #half ", %" #pb  \
-                 ", adds" tail ";\n}"                                                                  \
-                 : VLA_S##half(c) : "l"(a), "l"(b), "r"(static_cast<int>(adds)) : "memory")
-#define VLA_WGMMA_OF_ANY_SIZE(shape, tail, c)          \
-  VLA_WGMMA(48, 24, 25, 26, shape, tail, c);           \
-  VLA_WGMMA(64, 32, 33, 34, shape, tail, c);           \
-  VLA_WGMMA(80, 40, 41, 42, shape, tail, c);           \
-  VLA_WGMMA(96, 48, 49, 50, shape, tail, c);           \
-  VLA_WGMMA(112, 56, 57, 58, shape, tail, c);          \
-  VLA_WGMMA(128, 64, 65, 66, shape, tail, c);          \
-  VLA_WGMMA(144, 72, 73, 74, shape, tail, c);          \
-  VLA_WGMMA(160, 80, 81, 82, shape, tail, c);          \
-  VLA_WGMMA(176, 88, 89, 90, shape, tail, c);          \
-  VLA_WGMMA(192, 96, 97, 98, shape, tail, c);          \
-  VLA_WGMMA(208, 104, 105, 106, shape, tail, c);       \
-  VLA_WGMMA(224, 112, 113, 114, shape, tail, c);       \
-  VLA_WGMMA(240, 120, 121, 122, shape, tail, c);       \
-  VLA_WGMMA(256, 128, 129, 130, shape, tail, c)
-// The same with operand a in four registers, and operand b as its descriptor's columns of the depth. pb: the number of
-// operand b, which follows them.
-#define VLA_WGMMA_OF_REGISTERS(n, half, a0, a1, a2, a3, pb)                                                          \
-  if constexpr (kN == n)                                                                                             \
-    asm volatile("{\n.reg .pred adds;\nsetp.eq.u32 adds, 0, 0;\n"                                                    \
-                 "wgmma.mma_async.sync.aligned.m64n" #n "k16.f32.bf16.bf16 {" VLA_R##half "}, {%" #a0 ", %" #a1      \
-                 ", %" #a2 ", %" #a3 "}, %" #pb ", adds, 1, 1, 1;\n}"                                                \
-                 : VLA_S##half("+f") : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "l"(b) : "memory")
+// half: n / 2, the number of a thread's sums and of the operand that follows them; p1 to p5: numbers of those after it.
+#define VLA_WGMMA(n, half, operand_a, b, adds, shape, tail, c, ...)                                              \
+  if constexpr (kN == n)                                                                                         \
+    asm volatile("{\n.reg .pred adds;\nsetp.ne.b32 adds, %" #adds ", 0;\n"                                       \
+                 "wgmma.mma_async.sync.aligned.m64n" #n shape " {" VLA_R##half "}, " operand_a ", %" #b          \
+                 ", adds" tail ";\n}"                                                                            \
+                 : VLA_S##half(c) : __VA_ARGS__ : "memory")
+// Operand a in shared memory, or in four registers.
+#define VLA_WGMMA_OF_SHARED(n, half, p1, p2, p3, p4, p5, shape, tail, c) \
+  VLA_WGMMA(n, half, "%" #half, p1, p2, shape, tail, c, "l"(a), "l"(b), "r"(static_cast<int>(adds)))
+#define VLA_WGMMA_OF_REGISTERS(n, half, p1, p2, p3, p4, p5, shape, tail, c)                                      \
+  VLA_WGMMA(n, half, "{%" #half ", %" #p1 ", %" #p2 ", %" #p3 "}", p4, p5, shape, tail, c, "r"(a[0]), "r"(a[1]), \
+            "r"(a[2]), "r"(a[3]), "l"(b), "r"(static_cast<int>(adds)))
+#define VLA_WGMMA_OF_ANY_SIZE(form, shape, tail, c)         \
+  form(48, 24, 25, 26, 27, 28, 29, shape, tail, c);         \
+  form(64, 32, 33, 34, 35, 36, 37, shape, tail, c);         \
+  form(80, 40, 41, 42, 43, 44, 45, shape, tail, c);         \
+  form(96, 48, 49, 50, 51, 52, 53, shape, tail, c);         \
+  form(112, 56, 57, 58, 59, 60, 61, shape, tail, c);        \
+  form(128, 64, 65, 66, 67, 68, 69, shape, tail, c);        \
+  form(144, 72, 73, 74, 75, 76, 77, shape, tail, c);        \
+  form(160, 80, 81, 82, 83, 84, 85, shape, tail, c);        \
+  form(176, 88, 89, 90, 91, 92, 93, shape, tail, c);        \
+  form(192, 96, 97, 98, 99, 100, 101, shape, tail, c);      \
+  form(208, 104, 105, 106, 107, 108, 109, shape, tail, c);  \
+  form(224, 112, 113, 114, 115, 116, 117, shape, tail, c);  \
+  form(240, 120, 121, 122, 123, 124, 125, shape, tail, c);  \
+  form(256, 128, 129, 130, 131, 132, 133, shape, tail, c)
 // clang-format on
 
 /// sum[64, kN] (+)= a[64, 16] * b[kN, 16]^T of bf16 with sums in float32; `adds` keeps the old sums.
@@ -202,7 +200,7 @@ VLA_DEVICE void wgmma_wait_all(T (&sum)[kCount]) {
 template <int kN>
 VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
   static_assert(kN % 16 == 0 && kN >= 48 && kN <= 256);
-  VLA_WGMMA_OF_ANY_SIZE("k16.f32.bf16.bf16", ", 1, 1, 0, 0", "+f");
+  VLA_WGMMA_OF_ANY_SIZE(VLA_WGMMA_OF_SHARED, "k16.f32.bf16.bf16", ", 1, 1, 0, 0", "+f");
 }
 
 /// sum[64, kN] += a[64, 16] * b[16, kN] of bf16. a is in registers, which nobody may touch before the product was
@@ -211,17 +209,16 @@ VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t 
 template <int kN>
 VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], const unsigned (&a)[4], std::uint64_t b) {
   static_assert(kN == 64 || kN == 80 || kN == 128 || kN == 256);
-  VLA_WGMMA_OF_REGISTERS(64, 32, 32, 33, 34, 35, 36);
-  VLA_WGMMA_OF_REGISTERS(80, 40, 40, 41, 42, 43, 44);
-  VLA_WGMMA_OF_REGISTERS(128, 64, 64, 65, 66, 67, 68);
-  VLA_WGMMA_OF_REGISTERS(256, 128, 128, 129, 130, 131, 132);
+  constexpr bool adds = true;
+  VLA_WGMMA_OF_ANY_SIZE(VLA_WGMMA_OF_REGISTERS, "k16.f32.bf16.bf16", ", 1, 1, 1", "+f");
 }
 
-/// sum[64, kN] (+)= a[64, 32] * b[kN, 32]^T of signed bytes, exactly, else as wgmma_bf16.
+/// sum[64, kN] (+)= a[64, 32] * b[kN, 32]^T of signed bytes, exactly, else as wgmma_bf16 with a in registers: register
+/// h + 2 k of lane l has bytes 16 k + 4 (l % 4) to + 3 of row l / 4 + 8 h of the warp's 16.
 template <int kN>
-VLA_DEVICE void wgmma_s8(int (&sum)[kN / 2], std::uint64_t a, std::uint64_t b, bool adds) {
+VLA_DEVICE void wgmma_s8(int (&sum)[kN / 2], const unsigned (&a)[4], std::uint64_t b, bool adds) {
   static_assert(kN % 16 == 0 && kN >= 48 && kN <= 256);
-  VLA_WGMMA_OF_ANY_SIZE("k32.s32.s8.s8", "", "+r");
+  VLA_WGMMA_OF_ANY_SIZE(VLA_WGMMA_OF_REGISTERS, "k32.s32.s8.s8", "", "+r");
 }
 
 }  // namespace vla::cuda::dev

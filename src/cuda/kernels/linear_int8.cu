@@ -244,7 +244,7 @@ VLA_DEVICE void finish_four(const LinearInt8Job& job, int row, int column) {
   bool are_plain = true;
 #pragma unroll
   for (int c = 0; c < 4; ++c) are_plain = are_plain && (scale.of[c] == 0 || is_plain(scale.of[c]));
-  const RowRatios of(job, row, scale.of, are_plain);
+  const RowRatios of(RowOfCodes(job, row), scale.of, are_plain);
   Four scaled, gate = {};
 #pragma unroll
   for (int c = 0; c < 4; ++c) scaled.of[c] = of.scaled(sum[c], c);

@@ -71,11 +71,9 @@ inline Launch linear_int8(CodeKind kind, Int8Shape shape, const LinearInt8Job& j
 }
 
 /// Tiles of the kernels for Hopper only (hopper_linear_int8.cu): columns, a multiple of 64, and rows, a multiple of 16.
-/// There are fewer for int8 matrices, because their codes take four times as much shared memory as ternary codes.
-#define VLA_HOPPER_INT8_TILES(each) \
-  each(64, 64) each(64, 128) each(128, 64) each(128, 96) each(128, 128) each(128, 176) each(128, 224)
-#define VLA_HOPPER_TERNARY_TILES(each) \
-  VLA_HOPPER_INT8_TILES(each) each(128, 160) each(128, 192) each(128, 256) each(192, 112) each(192, 160) each(192, 224)
+#define VLA_HOPPER_CODE_TILES(each)                                                                                  \
+  each(64, 64) each(64, 128) each(128, 64) each(128, 96) each(128, 128) each(128, 160) each(128, 176) each(128, 192) \
+      each(128, 224) each(128, 256) each(192, 112) each(192, 160) each(192, 224)
 struct HopperInt8Tile {
   const char* kernel;
   CodeKind kind;
@@ -83,22 +81,21 @@ struct HopperInt8Tile {
 };
 constexpr HopperInt8Tile kHopperInt8Tiles[] = {
 #define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_int8_" #columns "x" #rows, CodeKind::int8, columns, rows},
-    VLA_HOPPER_INT8_TILES(VLA_HOPPER_TILE)
+    VLA_HOPPER_CODE_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 #define VLA_HOPPER_TILE(columns, rows) {"hopper_linear_ternary_" #columns "x" #rows, CodeKind::ternary, columns, rows},
-        VLA_HOPPER_TERNARY_TILES(VLA_HOPPER_TILE)
+        VLA_HOPPER_CODE_TILES(VLA_HOPPER_TILE)
 #undef VLA_HOPPER_TILE
 };
 constexpr int kHopperInt8Depth = 128;  // step of the depth, and unit of a split: each share has at least one
-/// Stages in shared memory: of rows of x and packed codes, and of unpacked codes. At the end, sums reuse the memory.
-constexpr int kHopperInt8Stages = 4, kHopperCodeStages = 3;
+/// Stages of rows of x and packed codes in shared memory, where sums follow them, and then 16 bytes for each row.
+constexpr int kHopperInt8Stages = 4, kRowOfCodesBytes = 16;
 constexpr int hopper_int8_stage_bytes(CodeKind kind, int columns, int rows) {
   return rows * kHopperInt8Depth + columns * column_bytes(kind) * (kHopperInt8Depth / Int8Tile::kDepth);
 }
 constexpr int hopper_int8_shared(CodeKind kind, int columns, int rows) {
-  const int stages = kHopperInt8Stages * hopper_int8_stage_bytes(kind, columns, rows);
-  const int all = stages + kHopperCodeStages * columns * kHopperInt8Depth, sums = rows * (columns + 4) * 4;
-  return all > sums ? all : sums;
+  const int stages = kHopperInt8Stages * hopper_int8_stage_bytes(kind, columns, rows), sums = rows * (columns + 4) * 4;
+  return (stages > sums ? stages : sums) + rows * kRowOfCodesBytes;
 }
 inline Launch hopper_linear_int8(const HopperInt8Tile& tile, const LinearInt8Job& job) {
   return {tile.kernel,

@@ -7,6 +7,9 @@
 
 namespace vla::cuda {
 
+/// Four ternary codes of a word, plus 1, as bytes.
+VLA_DEVICE unsigned ternary_fragment(unsigned word, int i) { return word >> 2 * i & 0x03030303U; }
+
 /// The codes of a packed tile (Int8Tile) that a lane owns: one column of every eight.
 template <CodeKind kKind>
 class LaneCodes {
@@ -25,7 +28,7 @@ class LaneCodes {
   }
   /// Four codes as signed bytes; ternary ones plus 1.
   VLA_DEVICE unsigned fragment(int eight, int i) const {
-    if constexpr (kKind == CodeKind::ternary) return words_[eight] >> 2 * i & 0x03030303U;
+    if constexpr (kKind == CodeKind::ternary) return ternary_fragment(words_[eight], i);
     if constexpr (kKind == CodeKind::int4) {
       // (code - 8) * step + 128 is an unsigned byte, so one multiplication makes four of them.
       const unsigned codes = words_[2 * eight + i / 2] >> i % 2 * 4 & 0x0f0f0f0fU, step = steps_ >> 8 * eight & 255;

@@ -36,21 +36,30 @@ VLA_DEVICE float quotient(float a, float b, float reciprocal) {
   return dev::multiply_add(dev::multiply_add(-b, q, a), reciprocal, q);
 }
 
+/// A row's scale, its reciprocal, the sum of the row's codes, and whether the scale is plain: four words, which the
+/// compiler then reads and writes at once.
+struct alignas(16) RowOfCodes {
+  float s = 1, reciprocal = 1;
+  int sum = 0, is_plain = 1;
+  RowOfCodes() = default;
+  VLA_DEVICE RowOfCodes(const LinearInt8Job& job, int row) {
+    const RowScale of(job, row);
+    s = of.s, reciprocal = dev::divide(1, s), sum = of.sum, is_plain = cuda::is_plain(s);
+  }
+};
+
 /// The scales of four columns, each divided by a row's, and the sum of the row's codes.
 struct RowRatios {
   float of[4] = {};
   int sum = 0;
   RowRatios() = default;
   /// are_plain: every scale of a column is plain or 0.
-  VLA_DEVICE RowRatios(const LinearInt8Job& job, int row, const float (&scale)[4], bool are_plain) {
-    const RowScale row_scale(job, row);
-    sum = row_scale.sum;
-    const float reciprocal = dev::divide(1, row_scale.s);
+  VLA_DEVICE RowRatios(const RowOfCodes& row, const float (&scale)[4], bool are_plain) : sum(row.sum) {
 #pragma unroll
-    for (int c = 0; c < 4; ++c) of[c] = quotient(scale[c], row_scale.s, reciprocal);
-    if (are_plain && is_plain(row_scale.s)) return;
+    for (int c = 0; c < 4; ++c) of[c] = quotient(scale[c], row.s, row.reciprocal);
+    if (are_plain && row.is_plain) return;
 #pragma unroll
-    for (int c = 0; c < 4; ++c) of[c] = dev::divide(scale[c], row_scale.s);
+    for (int c = 0; c < 4; ++c) of[c] = dev::divide(scale[c], row.s);
   }
   VLA_DEVICE float scaled(int product, int c) const { return dev::multiply(static_cast<float>(product), of[c]); }
 };
