@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <map>
 #include <memory>
+#include <span>
 #include <string>
 #include <vector>
 
@@ -74,12 +75,12 @@ class PtxModule {
 /// Runs all clusters, one after the other, and the blocks of a cluster in turns. Throws Fault.
 void run_ptx(const PtxKernel& kernel, Extent grid, unsigned n_thread, std::size_t shared, const void* job);
 
-// Between ptx_parse.cpp and ptx_instructions.cpp.
+// Between ptx_parse.cpp and the files of instructions: ptx_instructions.cpp, ptx_memory.cpp, ptx_wgmma.cpp.
 
 constexpr const char* kSpecials[] = {"%tid.x",    "%ctaid.x",  "%ctaid.y",  "%ctaid.z", "%ntid.x",
                                      "%nctaid.x", "%nctaid.y", "%nctaid.z", "%laneid"};
 
-/// An operation of the table: its operands' types in order, d for 4 bytes (also of 16-bit numbers), q for 8, p for a
+/// An operation of a table: its operands' types in order, d for 4 bytes (also of 16-bit numbers), q for 8, p for a
 /// predicate, s and g for addresses in shared and global memory, _ where there is no result.
 struct PtxOperation {
   const char* name;
@@ -87,6 +88,8 @@ struct PtxOperation {
   void (*run)(WarpState&, const PtxInstruction&);
   PtxInstruction::Kind kind = PtxInstruction::kPlain;
 };
+std::span<const PtxOperation> memory_operations();
+std::span<const PtxOperation> wgmma_operations();
 const PtxOperation* find_operation(const std::string& name);
 /// The product of a wgmma, and what runs it; null for others.
 void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, const PtxInstruction&);

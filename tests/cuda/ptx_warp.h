@@ -2,17 +2,21 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <bit>
 #include <list>
 #include <map>
 #include <set>
 #include <span>
+#include <string>
 #include <utility>
 #include <vector>
 
+#include "cuda/fault.h"
 #include "cuda/ptx.h"
 #include "cuda/wgmma.h"
 
-/// What instructions change (ptx_instructions.cpp), and who runs them reads (ptx_run.cpp).
+/// What instructions change (ptx_instructions.cpp, ptx_memory.cpp, ptx_wgmma.cpp), and who runs them reads
+/// (ptx_run.cpp).
 namespace vla::test::cuda {
 
 using u32 = std::uint32_t;
@@ -54,6 +58,25 @@ struct WarpState {
   u32& mask(u32 place) { return *lanes<u32>(place); }
   int thread(int lane) const { return number * kWarp + lane; }
 };
+
+template <class F>
+void each_lane(u32 active, F f) {
+  if (active == kAll)
+    for (int l = 0; l < kWarp; ++l) f(l);
+  else
+    for (; active != 0; active &= active - 1) f(std::countr_zero(active));
+}
+[[noreturn]] inline void fault_at(const WarpState& w, const PtxInstruction& i, int lane, const char* what) {
+  throw Fault("thread " + std::to_string(w.thread(lane)) + ": " + what + ": " + i.text);
+}
+template <class F>
+void guarded(const WarpState& w, const PtxInstruction& i, const int& lane, F access) {
+  try {
+    access();
+  } catch (const Fault& problem) {
+    fault_at(w, i, lane, problem.what());
+  }
+}
 
 /// While products are in flight, other instructions than wgmma may only rename their registers. Whether that was done.
 bool renames(WarpState& w, const PtxInstruction& i);
