@@ -88,8 +88,10 @@ struct PtxOperation {
   void (*run)(WarpState&, const PtxInstruction&);
   PtxInstruction::Kind kind = PtxInstruction::kPlain;
 };
+/// The tables of ptx_memory.cpp and ptx_wgmma.cpp.
 std::span<const PtxOperation> memory_operations();
 std::span<const PtxOperation> wgmma_operations();
+/// From any table; null for others.
 const PtxOperation* find_operation(const std::string& name);
 /// The product of a wgmma, and what runs it; null for others.
 void (*find_wgmma(const std::string& name, WgmmaProduct& product))(WarpState&, const PtxInstruction&);

@@ -205,10 +205,10 @@ VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], std::uint64_t a, std::uint64_t 
 
 /// sum[64, kN] += a[64, 16] * b[16, kN] of bf16. a is in registers, which nobody may touch before the product was
 /// waited for: in each warp those of operand a of dev::multiply_bf16. b is a descriptor of shared memory, see
-/// transposed_descriptor.
+/// swizzled_descriptor.
 template <int kN>
 VLA_DEVICE void wgmma_bf16(float (&sum)[kN / 2], const unsigned (&a)[4], std::uint64_t b) {
-  static_assert(kN == 64 || kN == 80 || kN == 128 || kN == 256);
+  static_assert(kN % 16 == 0 && kN >= 48 && kN <= 256);
   constexpr bool adds = true;
   VLA_WGMMA_OF_ANY_SIZE(VLA_WGMMA_OF_REGISTERS, "k16.f32.bf16.bf16", ", 1, 1, 1", "+f");
 }
@@ -237,18 +237,14 @@ VLA_DEVICE int swizzled(int row, int chunk) {
   return row * kRow + (chunk ^ row * kRow / 128 % (kRow / 16)) * 16;
 }
 
-/// The matrix descriptor of such rows. To advance by k bytes of a row, add k / 16.
+/// The matrix descriptor of such rows. To advance by k bytes of a row, add k / 16. A transposed b has a row for each
+/// element of the depth, with kRow / 2 columns; further columns are in rows that lie `next` bytes on. To advance by 16
+/// of its depth, add kRow.
 template <int kRow = kSwizzledRow>
-VLA_DEVICE std::uint64_t swizzled_descriptor(const std::byte* rows) {
+VLA_DEVICE std::uint64_t swizzled_descriptor(const std::byte* rows, int next = 16) {
   constexpr std::uint64_t kSwizzling = std::uint64_t{kRow == 128 ? 1 : 3} << 62, kStride = kRow * kSwizzledRows / 16;
-  return (dev::shared_address(rows) & 0x3ffffU) >> 4 | std::uint64_t{1} << 16 | kStride << 32 | kSwizzling;
-}
-/// The matrix descriptor of a transposed b: a row for each element of the depth, with kRow / 2 columns. Further columns
-/// are in rows that lie `next` bytes on. To advance by 16 of the depth, add kRow.
-template <int kRow>
-VLA_DEVICE std::uint64_t transposed_descriptor(const std::byte* rows, int next) {
-  return (swizzled_descriptor<kRow>(rows) & ~(std::uint64_t{0x3fff} << 16)) | static_cast<std::uint64_t>(next / 16)
-                                                                                  << 16;
+  const std::uint64_t first = (dev::shared_address(rows) & 0x3ffffU) >> 4;
+  return first | static_cast<std::uint64_t>(next / 16) << 16 | kStride << 32 | kSwizzling;
 }
 
 }  // namespace vla::cuda

@@ -164,7 +164,7 @@ class FlashWarp : AttentionWarp<S> {
   }
   /// y += weights v of the next tile.
   VLA_DEVICE void multiply_values() {
-    const std::uint64_t v = transposed_descriptor<S::kRow>(wait_for_next(), S::kKeys * S::kRow);
+    const std::uint64_t v = swizzled_descriptor<S::kRow>(wait_for_next(), S::kKeys * S::kRow);
     dev::wgmma_fence();
 #pragma unroll
     for (int i = 0; i < S::kKeys / 16; ++i) dev::wgmma_bf16<S::kDepth>(values(), weights_[i], v + i * S::kRow);

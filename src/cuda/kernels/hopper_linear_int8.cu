@@ -88,8 +88,8 @@ VLA_DEVICE void multiply(const LinearInt8Job& job) {
     if (i < n) fetch_x(shared + i * T::kBytesX, first + i);
     dev::commit_copies();
   }
-  if (const int row = thread_index(); row < T::kRows)
-    dev::write(terms + row * kRowOfCodesBytes, row0 + row < job.n_row ? RowOfCodes(job, row0 + row) : RowOfCodes());
+  if (const int row = thread_index(); row < T::kRows && row0 + row < job.n_row)
+    dev::write(terms + row * kRowOfCodesBytes, RowOfCodes(job, row0 + row));
 
   int sum[T::kRows / 2] = {};
   Operands first_half, second_half;

@@ -39,8 +39,8 @@ VLA_DEVICE float quotient(float a, float b, float reciprocal) {
 /// A row's scale, its reciprocal, the sum of the row's codes, and whether the scale is plain: four words, which the
 /// compiler then reads and writes at once.
 struct alignas(16) RowOfCodes {
-  float s = 1, reciprocal = 1;
-  int sum = 0, is_plain = 1;
+  float s, reciprocal;
+  int sum, is_plain;
   RowOfCodes() = default;
   VLA_DEVICE RowOfCodes(const LinearInt8Job& job, int row) {
     const RowScale of(job, row);
